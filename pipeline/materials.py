@@ -13,7 +13,8 @@ FACTBOOK = "The Physics Factbook"
 EUROCODE = "EN 1991-1-1"
 ROUGH = "rough"
 SCENERY = "scenery"  # the name of the static body
-UNMOVED = ("floor", SCENERY)  # bodies whose mass never counts
+SURROUNDINGS = "surroundings"  # the name of the room around it
+UNMOVED = ("floor", SCENERY, SURROUNDINGS)  # bodies whose mass never counts
 _WALL = re.compile(r"(\d+\.?\d*|\.\d+)(mm|cm|m)", re.ASCII)
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 

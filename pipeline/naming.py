@@ -5,7 +5,7 @@ import re
 import yaml
 
 # Names that a scene file uses already, and the folder of the scenery's shape.
-TAKEN = ("scenery", "scene", "floor", "box", "ball")
+TAKEN = ("scenery", "scene", "surroundings", "floor", "box", "ball")
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 NAMING = f"use letters, digits, - and _, a letter first; not {', '.join(TAKEN)}"
 

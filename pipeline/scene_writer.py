@@ -15,10 +15,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from pipeline.clearing import Cleared, cleared
-from pipeline.materials import SCENERY, Choice
+from pipeline.materials import SCENERY, SURROUNDINGS, Choice
 from pipeline.mesh.bodies import LAYER
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held, scene_keys
-from pipeline.mesh.meshing import TEXTURED, read_parts, rounded
+from pipeline.mesh.meshing import SHOWN_AROUND, SOLID_AROUND, TEXTURED, read_parts, rounded
 from pipeline.mesh.placement import LEVEL_NORMAL, MIN_FLOOR, Placement, load_placement
 from pipeline.mesh.visibility import heights
 from pipeline.records import BodyReport, FitReport, SceneReport
@@ -34,6 +34,7 @@ from sdfsim.sdf.far_field import BOX
 from sdfsim.sdf.sdf import Sdf
 
 SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells per side of a block sampled at once
+AROUND = 97  # samples a side of the room around, whose walls are flat
 SCENERY_SHARE = 2  # The scenery gets the budget of this many bodies, because it has more detail.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily
@@ -59,6 +60,7 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
     parts, skins = read_parts(mesh_folder), skins_of(mesh_folder)
     weights = {SCENERY: SCENERY_SHARE} if parts["scenery"] else {}
     weights |= {entry["name"]: 1 for entry in parts["objects"]}
+    weights |= {SURROUNDINGS: 1} if parts["surroundings"] else {}
     certificates, done = {}, 0.0
     for name, weight in weights.items():
         share = weight / sum(weights.values())
@@ -69,8 +71,8 @@ def fit_parts(mesh_folder: Path, out: Path, *, budget: float | None, recipe: str
             certificates[name] = load_shape(folder).certificate
             continue
         solid, shown = meshes_of(mesh_folder, name)
-        if sdf == "grid":
-            side = samples_of(solid, parts["cell"])
+        if sdf == "grid" or name == SURROUNDINGS:
+            side = AROUND if name == SURROUNDINGS else samples_of(solid, parts["cell"])
             shape = mesh_shape(
                 solid, name=name, kind="grid", cap=True, resolution=side, coarse=BLOCK, on_progress=report
             )
@@ -123,6 +125,8 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
     """The closed mesh of a part in its own frame, and its displayed mesh."""
     if name == SCENERY:
         return load_mesh(mesh_folder / "solid.ply"), load_mesh(mesh_folder / "shown.ply")
+    if name == SURROUNDINGS:
+        return load_mesh(mesh_folder / SOLID_AROUND), load_mesh(mesh_folder / SHOWN_AROUND)
     mesh = load_mesh(mesh_folder / "objects" / f"{name}.ply")
     moved = replace(mesh, vertices=mesh.vertices - origin_of(mesh))
     return moved, moved
@@ -131,7 +135,8 @@ def meshes_of(mesh_folder: Path, name: str) -> tuple[Mesh, Mesh]:
 def skins_of(mesh_folder: Path) -> dict[str, Mesh]:
     """The textured mesh of each part in its own frame; empty if there are no textures."""
     skins = read_glb(mesh_folder / TEXTURED) if (mesh_folder / TEXTURED).exists() else {}
-    origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in skins if name != SCENERY}
+    bodies = [name for name in skins if name not in (SCENERY, SURROUNDINGS)]
+    origins = {name: origin_of(load_mesh(mesh_folder / "objects" / f"{name}.ply")) for name in bodies}
     return {name: replace(skin, vertices=skin.vertices - origins.get(name, 0)) for name, skin in skins.items()}
 
 
@@ -169,7 +174,8 @@ def write_scene(
             message = "joint: the part that moves could not be cut off the rest as a body of its own"
             raise SdfsimError(f"{message}; {held.line()}", "photograph it from more sides", exit_code=EXIT_QUALITY)
         holder = holder_of(solids[PART], {name: mesh for name, mesh in everything.items() if name != PART})
-    text_of = partial(scene_text, placement, origins, scenery=parts["scenery"], drop=drop, materials=materials,
+    text_of = partial(scene_text, placement, origins, scenery=parts["scenery"],
+                      around=parts["surroundings"], drop=drop, materials=materials,
                       seed=seed, floor=floor, held=held, holder=holder)  # fmt: skip
     slab = None
     scene = load_scene(scene_file, text=text_of(None), allow_outside=True)
@@ -256,12 +262,13 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, BodyRepor
 
 
 def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
-               drop: str = "box", materials: dict[str, Choice] | None = None, seed: int = 0, floor: float = 0.0,
+               around: bool = False, drop: str = "box", materials: dict[str, Choice] | None = None,
+               seed: int = 0, floor: float = 0.0,
                held: HeldPart | None = None, holder: str | None = None,
                moved: dict[str, Cleared] | None = None) -> str:  # fmt: skip
-    """The text of scene.yaml: a floor at a height, m, the scenery, the bodies at their origins [3] m, and a body
-    dropped from above if there is a slab. A part `held` by a joint starts in its first state, and its `holder` is
-    static. Overlapping bodies are `moved`; bodies that the part overlaps do not touch it."""
+    """The text of scene.yaml: a floor at a height, m, the scenery, the room around, the bodies at their origins [3]
+    m, and a body dropped from above if there is a slab. A part `held` by a joint starts in its first state, and its
+    `holder` is static. Overlapping bodies are `moved`; bodies that the part overlaps do not touch it."""
     moved = moved or {}
     assumed = " (give --size or --distance for true metres)" if placement.size_assumed else ""
     made = materials or {}
@@ -271,7 +278,7 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
     def add(name: str, keys: str, shape: dict | None = None) -> None:
         choice = made.get(name, Choice())
         density = ""
-        if shape and name != SCENERY:
+        if shape and name not in (SCENERY, SURROUNDINGS):
             weight = f"density: {choice.material.density:g}" if choice.mass is None else f"mass: {choice.mass:g}"
             density = f"{weight}, "
         surface = f"friction: {choice.material.friction:g}, restitution: {choice.material.restitution:g}"
@@ -294,6 +301,8 @@ def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab 
         bodies.append(f"  - {{name: floor, {plane}}}")
     if scenery:
         add(SCENERY, "motion: static", {"asset": f"assets/{folder_of(SCENERY)}"})
+    if around:
+        add(SURROUNDINGS, "motion: static", {"asset": f"assets/{folder_of(SURROUNDINGS)}"})
     for name, origin in origins.items():
         keys = f"position: {_flow(rounded(origin).tolist())}"
         if held is not None and name == PART:

@@ -166,9 +166,9 @@ class Stage:
 STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
     "poses": Stage(do_poses, "poses", version=8),
-    "distill": Stage(do_distill, "distill", version=13),
+    "distill": Stage(do_distill, "distill", version=14),
     "mesh": Stage(do_mesh, "mesh", version=18),
-    "fit": Stage(do_fit, "assets", version=3),
+    "fit": Stage(do_fit, "assets", version=4),
     "scene": Stage(do_scene, "scene", version=8),
 }
 

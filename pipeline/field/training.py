@@ -31,6 +31,8 @@ from pipeline.field.supervision import (
 from pipeline.inputs.images import BACKDROP
 from pipeline.inputs.photos import load_photos, open_mask, open_photo
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
+from pipeline.stereo.far import save as save_far
+from pipeline.stereo.far import surrounding_distance
 from pipeline.stereo.fusion import Fused, fuse
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
@@ -434,6 +436,9 @@ def train(
     maps = stereo(seen, photos_folder, settings.stereo, on_progress=share_of(on_progress, 0.0, STEREO))
     carved = [outside_mask(one, photos_folder) for one in maps] if masked else maps
     fused = fuse(carved, settings.size.levels[-1], photos_folder) if maps else None
+    around = None if masked else surrounding_distance(maps)
+    if around is not None:
+        save_far(around, out)
     spent = time.monotonic() - begun
     paired = {"seconds": round(spent, 1), "fused": fused is not None, **stereo_summary(maps, seen)}
     budget = None if budget is None else budget - spent

@@ -13,18 +13,20 @@ from pipeline.cameras import PosedPhotos, Similarity, View, load_poses, save_vie
 from pipeline.field.training import load_field
 from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, open_photo
-from pipeline.materials import SCENERY
+from pipeline.materials import SCENERY, SURROUNDINGS
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import Distance, FieldSurface, ball, field_distance, sample_volume, surface_of
 from pipeline.mesh.hollows import hollow
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
 from pipeline.mesh.placement import GRAVITY, Placement, Scale, Up, given_up, located_bodies, measured_scale, place
 from pipeline.mesh.supports import complete, on_any
-from pipeline.mesh.texture import shots_of, texture_parts
+from pipeline.mesh.surroundings import surroundings_of
+from pipeline.mesh.texture import fewer, shots_of, texture_parts, textured
 from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, next_photos, summary
 from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
 from pipeline.records import MeshReport
+from pipeline.stereo.far import load as load_far
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.base.parallel import Progress, share_of, silent
@@ -33,6 +35,8 @@ from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write_ply
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
+SHOWN_AROUND, SOLID_AROUND = "surroundings.ply", "surroundings_solid.ply"
+ROUGH = 20_000  # faces of the room around that bodies meet: it is no finer than its cells
 RESOLUTION = {"quick": 256, "standard": 320}  # samples per side, by preset
 # The picture of names: largest number of photos, their width while they are chosen and in the picture, px, and the
 # tint.
@@ -88,6 +92,11 @@ def make_meshes(
         {name: placement.mesh(mesh) for name, mesh in ({SCENERY: first} | parts.bodies).items() if mesh is not None}
         for first in (parts.solid, parts.shown)
     )
+    around = None
+    if not alone and options.crop is None and (far := load_far(distill)) is not None:
+        on_progress(0.81, "looking at the room around")
+        inner = [mesh for mesh in (parts.solid, *parts.bodies.values()) if mesh is not None]
+        around = surroundings_of(far, placement.height, inner, posed.views, photos)
     whole = joined(list(closed.values()))
     views = posed.moved(placement.to_metres).views
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)
@@ -97,8 +106,16 @@ def make_meshes(
     counted = np.abs(limit(placement.to_metres.inverse().points(whole.vertices))) > 1.5 * surface.volume.cell
     proposed, cameras, weak = next_photos(closed, evidence, sight, shots.blocking, views, counted)
     save_views(cameras, out / NEXT)
-    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres)
-    write_bytes(out / TEXTURED, write_glb(texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.13))))
+    write_parts(parts, surface.visible, placement, evidence, out, field.finest * metres, around is not None)
+    skins = texture_parts(displayed, shots, share_of(on_progress, 0.87, 0.1))
+    if around is not None:
+        room = placement.mesh(around.shown)
+        write_bytes(out / SHOWN_AROUND, write_ply(room))
+        write_bytes(out / SOLID_AROUND, write_ply(fewer(placement.mesh(around.solid), ROUGH)))
+        blocking = Caster(joined([whole, room]))
+        lens = replace(shots, blocking=blocking, lift=around.cell * metres)
+        skins[SURROUNDINGS] = textured(room, lens, share_of(on_progress, 0.97, 0.03))
+    write_bytes(out / TEXTURED, write_glb(skins))
     deep = {name: hollow(closed[name], 2 * surface.volume.cell * metres, evidence) for name in parts.bodies}
     return MeshReport(
         extent_m=rounded(np.ptp(placement.mesh(surface.visible).vertices, axis=0)).tolist(),
@@ -162,10 +179,10 @@ def rounded(values: ArrayLike) -> np.ndarray:
 
 
 def write_parts(
-    parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path, cell: float
+    parts: Parts, visible: Mesh, placement: Placement, evidence: Evidence, out: Path, cell: float, surrounded: bool
 ) -> None:  # fmt: skip
     """Writes meshes in metres with the photos' evidence for their vertices, `placement.json` and `parts.json`; the
-    latter also holds the width of the field's cells, m."""
+    latter also holds the width of the field's cells, m, and whether the room around is there."""
 
     def write(name: str, mesh: Mesh) -> Mesh:
         moved = placement.mesh(mesh)
@@ -182,13 +199,14 @@ def write_parts(
         moved = write(f"objects/{name}.ply", mesh)
         low, high = moved.vertices.min(0), moved.vertices.max(0)
         objects.append({"name": name, "low": rounded(low).tolist(), "high": rounded(high).tolist()})
-    write_json(out / "parts.json", {"version": 1, "scenery": parts.solid is not None, "cell": cell, "objects": objects})
+    about = {"version": 1, "scenery": parts.solid is not None, "surroundings": surrounded, "cell": cell}
+    write_json(out / "parts.json", about | {"objects": objects})
     placement.save(out)
 
 
 def read_parts(mesh_folder: Path) -> dict:
     """The content of `parts.json` from `write_parts`. Raises SdfsimError if the mesh stage has not run."""
-    return read_json(mesh_folder / "parts.json", "run the mesh stage first")
+    return {"surroundings": False} | read_json(mesh_folder / "parts.json", "run the mesh stage first")
 
 
 def closed_files(mesh_folder: Path) -> dict[str, Path]:

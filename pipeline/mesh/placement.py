@@ -62,6 +62,10 @@ class Placement:
         """A mesh moved to metres."""
         return Mesh(self.to_metres.points(mesh.vertices), mesh.faces, mesh.colors)
 
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Heights [P] of points [P, 3], both in normalised space."""
+        return self.to_metres.points(points)[:, 2] / self.to_metres.scale
+
     def save(self, mesh_folder: Path) -> None:
         """Writes `placement.json`."""
         write_json(mesh_folder / "placement.json", {**vars(self), "to_metres": self.to_metres.to_dict()})

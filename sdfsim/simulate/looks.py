@@ -18,6 +18,7 @@ STATIC_COLOR = (150, 150, 155)
 HUES = 32  # number of colours for moving bodies
 # Of bodies' paths, see `extent`: a body that leaves the scene must not shrink it to a dot.
 FARTHEST, USUAL, BORDER = 1.0, 0.5, 0.8
+ROOM = 2.5  # times the size of what is in it, at least, of a static body that counts as the room around
 _CREASE = np.cos(np.radians(40.0))
 _MOST_CORNER_PAIRS = 1_000_000  # with more (about 10,000 vertices) a mesh counts as smooth: splitting triples it
 
@@ -45,9 +46,10 @@ def framed(scene: Scene, motion: Rollout | None = None) -> tuple[np.ndarray, flo
 def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
     """[2, 3] m: the lowest and highest coordinates that the first view must show.
 
-    These are the bodies at the start, except planes; the points on planes below them, as free bodies fall there; and,
-    if the motion is known, the bodies' paths up to `FARTHEST` times the size of all this, but of these only the middle
-    `USUAL` of all places and a border of `BORDER` times its size: who rolls away from the others is not followed.
+    These are the bodies at the start, except planes and a room around all others; the points on planes below them, as
+    free bodies fall there; and, if the motion is known, the bodies' paths up to `FARTHEST` times the size of all this,
+    but of these only the middle `USUAL` of all places and a border of `BORDER` times its size: who rolls away from the
+    others is not followed.
     """
     boxes: dict[int, np.ndarray] = {}
     planes = []
@@ -59,6 +61,10 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
             box = np.stack([shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)]) * body.scale
             corners = np.stack(np.meshgrid(*box.T), -1).reshape(-1, 3)
             boxes[k] = body.position + pose.rotate(body.quat_xyzw, corners)
+    for k in [k for k in boxes if scene.bodies[k].motion == "static"]:
+        others = [box for n, box in boxes.items() if n != k]
+        if others and _surrounds(boxes[k], np.concatenate(others)):
+            del boxes[k]
     if not boxes:
         return np.array([[-1.0] * 3, [1.0] * 3]) / np.sqrt(3.0)
     start = np.concatenate(list(boxes.values()))
@@ -76,6 +82,12 @@ def extent(scene: Scene, motion: Rollout | None = None) -> np.ndarray:
             ways = np.clip([ways - half, ways + half], first - border, last + border)
             low, high = np.minimum(low, ways.min((0, 1, 2))), np.maximum(high, ways.max((0, 1, 2)))
     return np.stack([low, high])
+
+
+def _surrounds(box: np.ndarray, others: np.ndarray) -> bool:
+    """Whether corners [8, 3] are of a room around other points [P, 3], much larger than what is in it."""
+    within = (others.min(0) > box.min(0)).all() and (others.max(0) < box.max(0)).all()
+    return bool(within and np.ptp(box, axis=0).max() > ROOM * np.ptp(others, axis=0).max())
 
 
 def is_infinite(shape: Shape) -> bool:
