@@ -1,8 +1,7 @@
 """Errors of a reconstruction of a rendered photo set.
 
     python -m benchmarks reconstruct -o DIR [--preset quick] [--budget MINUTES]
-    python -m benchmarks reconstruct -o DIR --capture record3d      # the same photos as a phone with depth exports them
-    python -m benchmarks reconstruct patches -o DIR [--capture record3d]
+    python -m benchmarks reconstruct patches -o DIR
 
 Runs all stages on samples/photos/table_vase, which is `room` of samples/photos/make.py, or on `patches`, rendered into
 DIR-patches (or takes an existing result in the folder), moves the result onto the true cameras by a similarity, and
@@ -10,11 +9,10 @@ records pose errors, surface errors, their relation to the run's uncertainty, ho
 times.
 
     python -m benchmarks reconstruct touching -o DIR
-    python -m benchmarks reconstruct shelf -o DIR [--kind clicks]
 
-render a set with known truth from tests/pipeline/photo_sets.py into DIR, reconstruct it with the masks of its bodies,
+renders a set with known truth from tests/pipeline/photo_sets.py into DIR, reconstructs it with the masks of its bodies,
 without masks (`plain`) and with one clicked place for each body (`clicks`: the middle of the body in the photo that
-shows most of it), or in one of these ways, and record the errors of every body.
+shows most of it), and records the errors of every body.
 
     python -m benchmarks reconstruct hinged -o DIR
     python -m benchmarks reconstruct sliding -o DIR
@@ -52,7 +50,6 @@ from sdfsim.simulate.simulator import Simulator
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
-RENDERED = ("touching", "shelf")
 WAYS = {"masks": "masks", "plain": "no masks", "clicks": "one place each, from stereo"}
 JOINTS = {"hinged": 50.0, "sliding": 0.2}  # degrees, and m, from the first state to the second
 NEAR_FLOOR = 0.03  # m: below this a surface belongs to the floor
@@ -254,19 +251,6 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def captured(layout: str, out: Path, photos: Path) -> Path:
-    """A rendered set as a phone's capture next to `out`, made if it does not exist."""
-    import phone
-
-    if layout not in phone.LAYOUTS:
-        raise SdfsimError(f"--capture: {layout}: is none of {', '.join(phone.LAYOUTS)}")
-    place = out.with_name(f"{out.name}-{layout}" + (".r3d" if layout == "record3d" else ""))
-    if not place.exists():
-        place.parent.mkdir(parents=True, exist_ok=True)
-        phone.write(layout, place, photos)
-    return place / "transforms.json" if layout == "nerfstudio" else place
-
-
 def drawn(photos: Path, out: Path) -> Path:
     """The folder of one of make.py's sets: the bundled one, or one next to `out`, made if it does not exist. Any other
     folder is returned unchanged."""
@@ -318,16 +302,16 @@ def clicked(photos: Path) -> dict[str, list[str]]:
     return found
 
 
-def rendered(name: str, out: Path, kind: str | None, **options: Any) -> list[tuple[Cell, ...]]:
-    """Renders a set of `photo_sets` and reconstructs it in each way, or in one: rows with the errors of the bodies."""
+def touching(out: Path, **options: Any) -> list[tuple[Cell, ...]]:
+    """Renders a set of `photo_sets` and reconstructs it in each way: rows with the errors of the bodies."""
     from pipeline.stages import reconstruct
     from tests.pipeline import photo_sets
 
     photos, rows = out / "photos", []
     if not photos.exists():
-        photo_sets.shoot_bodies(photos, getattr(photo_sets, name))
+        photo_sets.shoot_bodies(photos, photo_sets.touching)
         shutil.copytree(photos / "images", out / "plain")
-    for way in WAYS if kind is None else [kind]:
+    for way in WAYS:
         given = photos / "images" if way == "masks" else out / "plain"
         run = out / f"run_{way}"
         if way == "clicks":
@@ -410,8 +394,6 @@ def main(
     photos: Annotated[Path, typer.Argument()] = PHOTOS,
     *,
     out: Out,
-    capture: str | None = None,
-    kind: str | None = None,
     preset: str = "quick",
     size: float | None = None,
     distance: tuple[str, str, float] | None = None,
@@ -424,11 +406,9 @@ def main(
     command = " ".join(["python -m benchmarks reconstruct", *sys.argv[1:]]).replace(str(out), "DIR")
     with Session() as session:
         options["progress"] = session.stage_progress
-        if name in RENDERED:
-            if kind not in (None, *WAYS):
-                raise SdfsimError(f"--kind: {kind}: is none of {', '.join(WAYS)}")
+        if name == "touching":
             measured = f"A rendered set, *{preset}*: errors of the sides of its bodies' boxes and of their volumes."
-            write_record(f"reconstruct_{name}", command, measured, BODIES, rendered(name, out, kind, **options))
+            write_record(f"reconstruct_{name}", command, measured, BODIES, touching(out, **options))
             return
         if name in JOINTS:
             measured = f"A rendered object in two states, 30 photos of each, *{preset}*."
@@ -436,10 +416,9 @@ def main(
             return
         photos = drawn(photos, out)
         if not (photos / "truth.ply").exists():
-            raise SdfsimError(f"{photos}: no set with a known truth", f"{', '.join([*RENDERED, *JOINTS])} are others")
-        given = captured(capture, out, photos) if capture else photos
-        report = reconstruct(given, out, size=size, distance=distance, **options)
-        parts = [name, capture, preset, f"{budget:g}_minutes" if budget else None]
+            raise SdfsimError(f"{photos}: no set with a known truth", f"{', '.join(['touching', *JOINTS])} are others")
+        report = reconstruct(photos, out, size=size, distance=distance, **options)
+        parts = [name, preset, f"{budget:g}_minutes" if budget else None]
         name = "_".join(["reconstruct", *filter(None, parts)])
         found = evaluate(out, photos)
         write_record(name, command, f"{photos.name}, *{preset}*. {PERCENT}", FIGURE, figures(found, report))

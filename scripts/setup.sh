@@ -12,9 +12,6 @@ libraries=(
     libudev.so.1:libudev1 libusb-1.0.so.0:libusb-1.0-0 libgomp.so.1:libgomp1
 )
 
-# Only pictures without a screen need a Vulkan driver.
-drivers=(libvulkan.so.1:libvulkan1 libvulkan_lvp.so:mesa-vulkan-drivers)
-
 missing() {
     local known entry
     known="$(ldconfig -p 2>/dev/null || /sbin/ldconfig -p 2>/dev/null || true)"
@@ -69,11 +66,6 @@ if [ "${#wanted[@]}" -gt 0 ]; then
         say "Python 3.11, 3.12 or 3.13 is needed, and this system's package is older or newer"
         exit 1
     fi
-fi
-
-read -ra absent <<<"$(missing "${drivers[@]}")"
-if [ "${#absent[@]}" -gt 0 ]; then
-    install_packages "${absent[@]}" || say "without it, only pictures that are taken without a screen are missing"
 fi
 
 # The mark of a finished set-up: its inputs, then the installed extras. These stay installed.

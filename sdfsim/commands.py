@@ -136,23 +136,15 @@ def view(
     recording: Annotated[Path, typer.Argument(help="Run folder, rollout.rrd or rollout.npz.", show_default=False)],
     scene: OfRun = None,
     web: Annotated[bool, typer.Option("--web", help="In the browser.")] = False,
-    picture: Annotated[Path | None, typer.Option("--screenshot", help="Write a PNG instead; needs no screen.")] = None,
-    at: Annotated[float | None, typer.Option(help="Time of the screenshot, s (default: the end).")] = None,
     allow_outside: Outside = False,
 ) -> None:
-    """Watch a recording, or take a picture of it. A run without one is drawn from its rollout.npz first."""
-    if at is not None and picture is None:
-        raise SdfsimError("--at needs --screenshot", exit_code=EXIT_USAGE)
+    """Watch a recording. A run without one is drawn from its rollout.npz first."""
     from sdfsim.apps import run, viewer
 
     shapes = partial(session.stage_progress, "shapes")
     recording = run.recorded(recording, scene, say=session.say, allow_outside=allow_outside, on_progress=shapes)
-    if picture is not None:
-        viewer.screenshot(recording, picture, at=at)
-        session.report({"screenshot": picture})
-    else:
-        viewer.show(recording, web=web, say=session.say)
-        session.report({"recording": recording})
+    viewer.show(recording, web=web, say=session.say)
+    session.report({"recording": recording})
 
 
 @command

@@ -1,10 +1,8 @@
 """The report of the command info: versions, devices, models; what is missing, what it is for, and how to get it."""
 
-import ctypes
 import importlib
 import platform
 import re
-import sys
 from importlib import metadata
 from typing import Any
 
@@ -32,7 +30,6 @@ LIBRARIES = {
     "libGL.so.1": "libgl1", "libEGL.so.1": "libegl1", "libX11.so.6": "libx11-6", "libudev.so.1": "libudev1",
     "libusb-1.0.so.0": "libusb-1.0-0", "libgomp.so.1": "libgomp1",
 }  # fmt: skip
-DRIVER = ("libvulkan_lvp.so", "libvulkan1 mesa-vulkan-drivers")  # graphics on the processor
 
 
 def about() -> dict[str, Any]:
@@ -61,8 +58,6 @@ def about() -> dict[str, Any]:
         missing.append(f"the viewer of recordings: {error.hint}")
     if not has_screen():
         missing.append("a screen: use the browser (view --web), or render movies and pictures")
-    if sys.platform == "linux" and not _loads(DRIVER[0]):
-        missing.append(f"a Vulkan driver, for view --screenshot: apt-get install {DRIVER[1]}")
     if not _compiled():
         missing.append("the compiled contact step: the first run compiles it, in about a minute")
     return {
@@ -98,14 +93,6 @@ def _unloaded(module: str, why: str) -> str:
     if lacking and lacking[0] in LIBRARIES:
         return f"{lacking[0]}, which {module} loads: apt-get install {LIBRARIES[lacking[0]]}"
     return f"{module} does not load: {' '.join(why.split())[:200]}"
-
-
-def _loads(library: str) -> bool:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        return False
-    return True
 
 
 def _compiled() -> bool:

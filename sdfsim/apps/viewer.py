@@ -1,4 +1,4 @@
-"""The rerun viewer: live streams, recordings on disk, and pictures taken without a screen."""
+"""The rerun viewer: live streams, and recordings on disk."""
 
 import atexit
 import os
@@ -17,13 +17,10 @@ from types import FrameType
 from sdfsim.apps.recording import Playback
 from sdfsim.base.errors import SdfsimError
 
-WINDOW = "1600x900"
 LOOPBACK = "127.0.0.1"  # the address on which viewers listen; by default they would listen on the whole network
 _GRPC_PORT, _WEB_PORT = 9876, 9090
 _START_SECONDS = 60.0
 _WINDOWS_CTRL_C = 0xC000013A  # the exit code there
-_TOAST_SECONDS = 10.0  # the notices at the start cover the plots until they fade
-_NO_GRAPHICS = "it needs a Vulkan driver: apt-get install mesa-vulkan-drivers"
 
 
 def stream_to_viewer(playback: Playback, kind: str) -> str:
@@ -124,52 +121,6 @@ def show(recording: Path, *, web: bool = False, say: Callable[[str], None] = lam
         raise
     if code not in (0, -signal.SIGINT, 130, _WINDOWS_CTRL_C):
         raise SdfsimError(f"the rerun viewer ended with code {code}", "without a screen: sdfsim view --web")
-
-
-def screenshot(recording: Path, picture: Path, *, at: float | None = None) -> None:
-    """Write the viewer's picture of a recording `at` a time in s (default: the end) as a PNG, without a screen. Raises
-    SdfsimError if there is no such recording or time, if there is no graphics driver, or if the file cannot be
-    written."""
-    recording = _recording(recording)
-    if not picture.parent.is_dir() or not os.access(picture.parent, os.W_OK):
-        raise SdfsimError(f"{picture}: the folder is missing or not writable")
-    port = free_port()
-    viewer = _launch(port, ["--headless", "--window-size", WINDOW, str(recording.resolve())])
-    try:
-        _picture(viewer, _address(port), picture, at)
-    except ConnectionError as error:
-        raise SdfsimError(f"{recording}: no picture: {str(error).splitlines()[0]}", _NO_GRAPHICS) from error
-    finally:
-        _end(viewer)
-
-
-def _picture(viewer: subprocess.Popen, address: str, picture: Path, at: float | None) -> None:
-    from rerun.experimental import ViewerClient
-
-    started = time.monotonic()
-    while True:
-        try:
-            client = ViewerClient.connect(address)
-            state = client.get_state()
-            if state.active_recording and not state.loading:
-                break
-        except ConnectionError:
-            pass
-        if viewer.poll() is not None or time.monotonic() - started > _START_SECONDS:
-            raise ConnectionError("the viewer did not start")
-        time.sleep(0.2)
-    timelines = {t.name: t for recording in state.recordings for t in recording.timelines}
-    if time_line := timelines.get("time"):
-        first, last = (time_line.start or 0) * 1e-9, (time_line.end or 0) * 1e-9
-        # A run is a whole number of steps, so it may end up to one step before the wanted time; then take its end.
-        step = (last - first) / max(timelines["step"].end or 0, 1) if "step" in timelines else 0.0
-        if at is not None and not first <= at <= last + max(step, 1e-6):
-            raise SdfsimError(f"--at {at:g}: the recording holds {first:g} to {last:g} s")
-        client.set_time("time", duration=last if at is None else min(at, last), play_state="paused")
-    time.sleep(_TOAST_SECONDS)
-    client.save_screenshot(str(picture.resolve()))
-    if not picture.exists():
-        raise SdfsimError(f"{picture}: cannot be written")
 
 
 def _end(process: subprocess.Popen) -> None:

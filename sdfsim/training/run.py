@@ -7,7 +7,7 @@ import math
 from copy import deepcopy
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,9 +18,6 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.training.batches import moved
 from sdfsim.training.presets import Preset
-
-if TYPE_CHECKING:
-    pass
 
 EMA_DECAY = 0.999
 CLIP = 1.0

@@ -2,7 +2,6 @@
 cached."""
 
 import json
-import math
 import signal
 import threading
 import time
@@ -26,26 +25,24 @@ def train(
     data: Path | Sequence[Path],
     out: Path,
     *,
-    preset: str | Preset = "gnn",
+    preset: str = "gnn",
     resume: bool = False,
     steps: int | None = None,
     seed: int = 0,
     device: str = "cpu",
-    budget: float = math.inf,
     on_progress: Progress = silent,
 ) -> dict:
     """Train a preset on one or several datasets; write `model.safetensors`, `log.jsonl` and a checkpoint in `out`.
 
     Datasets have train/ and validation/; several (impulse only) are used as if they were one. The preset is a name in
-    `PRESETS`, or your own, with other `steps` if given. `resume` continues from the checkpoint in `out`, with the
-    result of an uninterrupted run. `budget` is processor time in s, all cores together, after which training stops
-    early. Returns paths, losses and processor time.
+    `PRESETS`, with other `steps` if given. `resume` continues from the checkpoint in `out`, with the result of an
+    uninterrupted run. Returns paths, losses and processor time.
     Raises SdfsimError if data are unusable, if `out` has a checkpoint and `resume` is not set, if another run is
     writing to `out`, or if training diverges.
     """
     from sdfsim.base.devices import pick_device
 
-    plan = PRESETS[preset] if isinstance(preset, str) else preset
+    plan = PRESETS[preset]
     folders = [data] if isinstance(data, Path) else list(data)
     total = plan.steps if steps is None else steps
     if total < 1:
@@ -62,8 +59,8 @@ def train(
         if checkpoint.exists():
             run.load(checkpoint)
         _shorten(out / "log.jsonl", run.step)
-        _loop(run, held_out, out, budget, on_progress)
-        run.export(preset if isinstance(preset, str) else preset.kind, made).save(out / "model.safetensors")
+        _loop(run, held_out, out, on_progress)
+        run.export(preset, made).save(out / "model.safetensors")
         report = {"steps": run.step, "seconds": run.seconds, "loss": run.loss}
         report |= {"model": str(out / "model.safetensors"), "held_out_loss": held_out_loss(run, held_out)}
     return report
@@ -99,10 +96,10 @@ def _tasks(plan: Preset, folders: Sequence[Path], tell: Progress):
     return SurfaceTask(data, "train", plan, noisy=True), SurfaceTask(data, "validation", plan)
 
 
-def _loop(run: Run, held_out: Any, out: Path, budget: float, on_progress: Progress) -> None:
+def _loop(run: Run, held_out: Any, out: Path, on_progress: Progress) -> None:
     saved = time.monotonic()
     try:
-        while run.step < run.total and run.seconds < budget:
+        while run.step < run.total:
             started = time.process_time()
             with _uninterrupted():
                 run.advance()

@@ -1,4 +1,4 @@
-"""Which moment of a recording a picture shows, and when the address of a page is told."""
+"""Which recording is shown, and when the address of a page is told."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import sys
 import urllib.request
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,44 +15,6 @@ import pytest
 from sdfsim import Rollout, SdfsimError
 from sdfsim.apps import viewer
 from tests.helpers.command import run
-
-STEP = 4.0 / 240.5  # s: 4 s are 240 steps and a half, so the last of 240 is before them
-
-
-class Client:
-    """Stands for a viewer that holds a recording of 240 steps."""
-
-    shown: float
-
-    @classmethod
-    def connect(cls, address: str) -> Client:
-        return cls()
-
-    def get_state(self) -> SimpleNamespace:
-        end = round(240 * STEP * 1e9)
-        lines = [SimpleNamespace(name="step", start=0, end=240), SimpleNamespace(name="time", start=0, end=end)]
-        return SimpleNamespace(active_recording="run", loading=False, recordings=[SimpleNamespace(timelines=lines)])
-
-    def set_time(self, timeline: str, *, duration: float, **rest: Any) -> None:
-        Client.shown = duration
-
-    def save_screenshot(self, path: str) -> None:
-        Path(path).touch()
-
-
-@pytest.mark.parametrize(
-    ("at", "shown"), [(None, 240 * STEP), (0.0, 0.0), (1.5, 1.5), (4.0, 240 * STEP), (4.02, None), (-0.01, None)]
-)
-def test_the_time_that_a_run_was_asked_for_is_its_end(tmp_path, monkeypatch, at, shown):
-    monkeypatch.setattr("rerun.experimental.ViewerClient", Client)
-    monkeypatch.setattr(viewer, "_TOAST_SECONDS", 0.0)
-    process: Any = SimpleNamespace(poll=lambda: None)
-    if shown is None:
-        with pytest.raises(SdfsimError, match=rf"--at {at:g}: .*\b0 to 3\.99168 s"):
-            viewer._picture(process, "", tmp_path / "x.png", at)
-    else:
-        viewer._picture(process, "", tmp_path / "x.png", at)
-        assert Client.shown == pytest.approx(shown, abs=1e-9)
 
 
 @pytest.mark.parametrize("name", ["rollout.rrd", "reconstruction.rrd"])

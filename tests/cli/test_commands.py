@@ -109,7 +109,6 @@ def test_a_bad_scene_is_one_line_and_code_1(tmp_path, command):
         ("simulate", "scene.yaml", "-o", "run", "--seconds", "-1"),
         ("reconstruct", "photos", "-o", "out", "--budget", "soon"),
         ("reconstruct", "photos", "-o", "out", "--from", "dessert"),
-        ("view", "run.rrd", "--at", "1"),
         ("fit", "mesh.obj"),
         ("fit", ".", "--cap"),
         ("nonsense",),

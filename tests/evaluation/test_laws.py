@@ -16,7 +16,7 @@ SLOW = {
     "slender", "heaps", "seams", "rolling", "facets", "round_on_meshes", "flat_drops", "slabs", "spins", "bullets",
     "chains", "rollers", "nuts",
 }  # fmt: skip
-FAST_GROUPS = ("overlap", "thin", "mass", "bounce", "slope")  # of hard cases
+FAST_GROUPS = ("overlap", "thin")  # of hard cases
 # Three sizes and orientations, and what solids are made of.
 SETTINGS = (
     Setting(), Setting(kind="mesh"), Setting(size=0.02, yaw=37.0), Setting(size=1.0, yaw=121.0), Setting(kind="grid"),
