@@ -196,12 +196,27 @@ def near_axis() -> np.ndarray:
 
 
 def vase_size(mesh: Any) -> dict[str, float]:
-    """Height and depth of the hollow, cm: vertical rays within 2 cm of the axis measure the depth below the rim."""
+    """Height and depth of the hollow, cm: vertical rays within 2 cm of the axis measure the depth below the rim. Also
+    the share of the belly's air, below the neck, that is empty, and the volume of the matter as a share of the true one,
+    both in percent, from random places in the true profiles."""
+    import make
+
+    rng = np.random.default_rng(0)
+    outer, inner = np.array(make.VASE_OUTER), np.array(make.VASE_INNER)[::-1]
+    wide, tall = outer.max(0)
+    places = rng.uniform([-wide, -wide, 0], [wide, wide, tall], (400_000, 3))
+    away, height = np.linalg.norm(places[:, :2], axis=1), places[:, 2]
+    hollow = (away < np.interp(height, *inner.T[::-1])) & (height > inner[0, 1])
+    belly = hollow & (height < make.VASE_INNER[1][1])
+    matter = (away < np.interp(height, *outer.T[::-1])) & ~hollow
+    within = _scene(mesh).compute_occupancy((places + [*VASE, TABLE]).astype(np.float32), nsamples=5).numpy() > 0.5
     at = near_axis()
     down = np.concatenate([at, np.full((len(at), 1), 2.0), np.tile([0.0, 0, -1], (len(at), 1))], 1)
     top = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)[:, 2].max()
     hit = 2.0 - _scene(mesh).cast_rays(down.astype(np.float32))["t_hit"].numpy()
-    return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE)}
+    return {"hollow_cm": 100 * float(top - np.median(hit)), "height_cm": 100 * float(top - TABLE),
+            "belly_percent": 100 * float(1 - within[belly].mean()),
+            "matter_percent": 100 * float(within.sum() / matter.sum())}  # fmt: skip
 
 
 def dropped_ball(folder: Path, name: str, scale: float = 1.0) -> dict[str, float]:
@@ -377,6 +392,8 @@ def figures(found: dict[str, Any], report: dict[str, Any]) -> list[tuple[Cell, .
     for name, size in surface["vase"].items():
         below = found["ball"][name]["below_rim_cm"]
         rows.append((f"hollow of the vase, cm (truth: {truth:.0f})", size["hollow_cm"]))
+        rows.append(("air in the belly of the vase that is empty, %", size["belly_percent"]))
+        rows.append(("matter of the vase, % of the true volume", size["matter_percent"]))
         rows.append((f"middle of a ball of {100 * BALL:g} cm radius dropped into it, cm below its rim", below))
     rows += [("error of the scale, %", surface["scale_error_percent"]), ("steps", steps.get("iterations"))]
     rows += [("training of the field with stereo, min", report["seconds"]["distill"] / 60)]
