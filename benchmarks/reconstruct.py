@@ -197,8 +197,8 @@ def near_axis() -> np.ndarray:
 
 def vase_size(mesh: Any) -> dict[str, float]:
     """Height and depth of the hollow, cm: vertical rays within 2 cm of the axis measure the depth below the rim. Also
-    the share of the belly's air, below the neck, that is empty, and the volume of the matter as a share of the true one,
-    both in percent, from random places in the true profiles."""
+    the share of the belly's air, below the neck, that is empty, and the volume of the matter, as a share of the true
+    one, both in percent, from random places in the true profiles."""
     import make
 
     rng = np.random.default_rng(0)
@@ -209,7 +209,9 @@ def vase_size(mesh: Any) -> dict[str, float]:
     hollow = (away < np.interp(height, *inner.T[::-1])) & (height > inner[0, 1])
     belly = hollow & (height < make.VASE_INNER[1][1])
     matter = (away < np.interp(height, *outer.T[::-1])) & ~hollow
-    within = _scene(mesh).compute_occupancy((places + [*VASE, TABLE]).astype(np.float32), nsamples=5).numpy() > 0.5
+    within = (
+        _scene(mesh).compute_occupancy((places + np.append(VASE, TABLE)).astype(np.float32), nsamples=5).numpy() > 0.5
+    )
     at = near_axis()
     down = np.concatenate([at, np.full((len(at), 1), 2.0), np.tile([0.0, 0, -1], (len(at), 1))], 1)
     top = np.asarray(mesh.vertices)[np.asarray(mesh.triangles)].reshape(-1, 3)[:, 2].max()

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
 from sdfsim import load_scene
@@ -75,6 +76,17 @@ def test_the_first_view_shows_all_of_the_motion(scene, rollout):
     # What leaves for good does not make the rest a dot.
     rollout.position[:, 2, 0] = np.linspace(0.0, 1e6, STEPS + 1)
     assert framed(scene, rollout)[1] < (FARTHEST + 1) * 2 * framed(scene)[1] * np.sqrt(3)
+
+
+def test_the_first_view_is_of_what_is_in_a_room_and_not_of_the_room():
+    def view(size: float) -> float:
+        walls = {"name": "walls", "shape": "walls", "motion": "static"}
+        ball = {"name": "ball", "shape": "ball", "position": [0.2, 0, 0]}
+        shapes = {"walls": {"box": {"size": [size] * 3}}, "ball": {"sphere": {"radius": 0.5}}}
+        text = yaml.safe_dump({"version": 1, "shapes": shapes, "bodies": [ball, walls]})
+        return framed(load_scene("scene.yaml", text=text))[1]
+
+    assert view(10.0) == pytest.approx(np.sqrt(3) / 2) and view(2.0) == pytest.approx(np.sqrt(3))
 
 
 def test_a_file_holds_the_rollout(scene, rollout, tmp_path):
