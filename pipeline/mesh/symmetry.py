@@ -25,6 +25,7 @@ from pipeline.mesh.visibility import framed
 from sdfsim.geometry.bvh import Caster, ClosestPoint
 from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 
+FINER = 0.5  # cells of the field between samples, so that a completed body keeps its detail
 SURE = 0.5  # cells of the field: largest uncertainty of a place that is known, see `Evidence`
 TURNS = 48  # images of a place about an axis
 SAMPLES = 2000  # places of the surface that are compared with their images
@@ -84,7 +85,7 @@ class Known:
         self._near = ClosestPoint(mesh)
         self.normals = vertex_normals(mesh)
         low, high = mesh.vertices.min(0) - 3 * cell, mesh.vertices.max(0) + 3 * cell
-        self.volume = sample_box(self.distance, low, high, cell)
+        self.volume = sample_box(self.distance, low, high, FINER * cell)
         self.trust = replace(self.volume, values=self._trust())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -101,7 +102,7 @@ class Known:
         seen = self.seen[nearest].reshape(values.shape).astype(np.float32)
         far = np.flatnonzero(values > self.cell)
         seen.reshape(-1)[far] = self.air(points[far])
-        return ndimage.gaussian_filter(seen, 1.0) * np.exp2(-((np.minimum(values, 0) / (DEEP * self.cell)) ** 2))
+        return ndimage.gaussian_filter(seen, 1 / FINER) * np.exp2(-((np.minimum(values, 0) / (DEEP * self.cell)) ** 2))
 
     def air(self, points: np.ndarray) -> np.ndarray:
         """Whether two photos show air at points [P, 3]: what they see lies behind."""
@@ -214,7 +215,7 @@ def filled(known: Known, symmetry: Symmetry, up: np.ndarray) -> Completed:
         mean, weight, doubt = volume.at(image).clip(-most, most), known.trust.at(image), 0.0
     else:
         mean, weight, doubt = profile(known, symmetry).at(points)
-    values += np.clip(weight / KNOWN, 0, 1) * (1 - own * (1 - doubt)) * (mean - values)
+    values += np.clip(2 * weight / KNOWN - 1, 0, 1) * (1 - own * (1 - doubt)) * (mean - values)
     values = np.maximum(values, (vertices @ up).min() - points @ up)
     values = values.reshape(volume.values.shape).astype(np.float32)
     # What is deep inside is known of no image; a new surface encloses it.
@@ -295,6 +296,7 @@ def profile(known: Known, symmetry: Symmetry) -> Profile:
             unknown = filled & ((weight < KNOWN) | apart & (behind > 0))
             unknown[:, :bottom] = unknown[:, top:] = False
             mean = np.where(unknown, behind.clip(-most, most), np.where(filled, np.minimum(mean, behind), mean))
-            weight = np.where(unknown, 1.0, weight)
-            doubted = unknown
+            # Pits in a thin floor are noise, which turns into a ring about the axis or a hole.
+            doubted = unknown | filled & (depth > 0.75 * cell) & (np.arange(len(z)) < bottom)
+            weight = np.where(doubted, 1.0, weight)
     return Profile(symmetry, mean, weight, doubted.astype(float), low, cell)
