@@ -412,11 +412,7 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
         seen = shown(take.scene, k, take.plane_size())
-        form = (
-            body.shape,
-            body.scale,
-            k if is_infinite(shape) else -1,
-        )  # planes differ by the scenery that lies in them
+        form = (body.shape, body.scale, k if is_infinite(shape) else -1)  # planes differ by what lies in them
         own = seen.colors is not None or seen.texture is not None
         if form not in arrays:
             mesh, normals = with_normals(seen)
@@ -661,15 +657,16 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _pxr("UsdGeom"), _pxr("Vt")
-    mesh, normals = with_normals(mesh)
-    prim = geom.Mesh.Define(stage, path)
-    prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
+    split, normals = with_normals(mesh)
+    prim, points = geom.Mesh.Define(stage, path), vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
+    prim.CreatePointsAttr(points)
+    prim.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
     prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)
-    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
-    prim.SetNormalsInterpolation(geom.Tokens.vertex)
+    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals[split.faces.reshape(-1)].astype(np.float32)))
+    prim.SetNormalsInterpolation(geom.Tokens.faceVarying)
     if mesh.colors is not None:
         tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         tint.Set(vt.Vec3fArray.FromNumpy(light(mesh.colors).astype(np.float32)))
