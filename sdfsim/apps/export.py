@@ -438,10 +438,13 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
-    _gltf_physics(take, file)
-    left_out = ["gravity: glTF has none, programs use their own", *_missing(take, motion=True, textures=True)]
-    if take.scene.joints:
-        left_out += jointed.gltf_joints(file, take.scene, _joint_names(take))
+    left_out = _missing(take, motion=True, textures=True)
+    if take.moving:  # by the draft bodies then follow their motion; and Blender would show each collider
+        left_out.insert(0, "masses, friction and everything else that is not visible: the export of the scene has them")
+    else:
+        _gltf_physics(take, file)
+        left_out.insert(0, "gravity: glTF has none, programs use their own")
+        left_out += jointed.gltf_joints(file, take.scene, _joint_names(take)) if take.scene.joints else []
     write_bytes(out, file.to_bytes())
     return [out], left_out
 
