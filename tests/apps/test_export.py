@@ -3,9 +3,11 @@ judged by the validators of Khronos, OpenUSD and NVIDIA."""
 
 import csv
 import json
+import os
 import shutil
 import struct
 import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -272,6 +274,15 @@ def test_khronos_validator_finds_no_fault_in_a_glb(dropped, tmp_path):
     assert faults(moving) == 0
     (tmp_path / "bad.glb").write_bytes(moving.read_bytes().replace(b'"LINEAR"', b'"BEZIER"'))
     assert faults(tmp_path / "bad.glb") > 0
+
+
+@pytest.mark.slow
+def test_blender_opens_a_run_with_the_add_on(dropped):
+    if not (python := os.environ.get("BLENDER_PYTHON")):
+        pytest.skip("BLENDER_PYTHON names no Python with bpy: see scripts/blender_check.py")
+    script = SHAPES.parents[1] / "scripts" / "blender_check.py"
+    done = subprocess.run([python, script, dropped.folder, Path(sys.executable).with_name("sdfsim")], text=True)
+    assert done.returncode == 0
 
 
 @pytest.mark.slow
