@@ -596,6 +596,8 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         solid.AddScaleOp().Set(gf.Vec3f(body.scale))
 
     group, allowed = contact_groups(take.scene.bodies)
+    if not allowed.all():
+        stage.DefinePrim("/World/groups", "Scope")
     for g in range(len(allowed) if not allowed.all() else 0):
         made = physics.CollisionGroup.Define(stage, f"/World/groups/group_{g}")
         for k in np.flatnonzero(group == g):
