@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: data, bench, test, cluster, docs, export, learn, record3d, rivals)
+# Makes .venv with the project in it, ready to run. Usage: bash scripts/setup.sh [EXTRA ...]   (extras: bench, data, docs, export, learn, record3d, rivals, test)
 # A second run does nothing, unless pyproject.toml has changed or it names a new extra.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."

@@ -155,7 +155,7 @@ def test_training_needs_torch_and_numpy_only():
         "import importlib.metadata as m, re, sys\n"
         "ours = [re.match(r'[\\w.-]+', r)[0] for r in m.requires('sdfsim')]\n"
         "names = {'PyYAML': 'yaml', 'scikit-image': 'skimage', 'libigl': 'igl', 'rerun-sdk': 'rerun'}\n"
-        "for name in {names.get(n, n) for n in ours} - {'torch', 'numpy'}:\n    sys.modules[name] = None\n"
+        "for name in {names.get(n, n) for n in ours} - {'torch', 'numpy', 'sdfsim'}:\n    sys.modules[name] = None\n"
         "import sdfsim.training.train"
     )
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

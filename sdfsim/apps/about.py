@@ -19,11 +19,11 @@ EXTRAS = {
     "usd-core": ("export", "export of .usd"),
     "coacd": ("export", "convex pieces, which .xml and .urdf need for shapes without any"),
     "pybullet": ("data", "training data, and comparisons with PyBullet"),
-    "mujoco": ("mjcf", "import of MJCF, and comparisons with MuJoCo"),
+    "mujoco": ("export", "import of MJCF, and comparisons with MuJoCo"),
     "matplotlib": ("bench", "plots of tradeoff and stress, the picture of identify"),
     "imagecodecs": ("record3d", "depth of Record3D"),
     "OpenEXR": ("record3d", "depth of Record3D, in its other form"),
-    "distributed": ("cluster", "work on a Dask cluster"),
+    "distributed": ("learn", "work on a Dask cluster"),
 }
 # System libraries that packages load, and their Debian packages.
 LIBRARIES = {

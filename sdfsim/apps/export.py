@@ -55,6 +55,8 @@ USD_GRIDS = {
     "NewtonSDFCollisionAPI": "newton:sdfMaxResolution",
 }
 USD_CELLS = 256
+# What glTF's drafts of physics have along y, we have along z.
+UPRIGHT = [0.5**0.5, 0.0, 0.0, 0.5**0.5]
 STEP = 0.001  # s, the step of MuJoCo
 SOFT = 4.0  # steps, over 2 pi: the period of a MuJoCo contact
 MOST_PAIRS = 1000  # pairs of geoms whose coefficients are written one by one
@@ -304,6 +306,13 @@ def _inertia(body: Body, shape: Shape) -> np.ndarray:
     return body.inertia if body.inertia is not None else body.mass / shape.volume * body.scale**2 * shape.inertia
 
 
+def _principal(body: Body, shape: Shape) -> tuple[np.ndarray, Rotation]:
+    """Principal moments [3] kg m^2 of a dynamic body, and the turn of their axes in the shape's."""
+    moments, axes = np.linalg.eigh(_inertia(body, shape))
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    return moments, Rotation.from_matrix(axes)
+
+
 def convex_pieces(shape: Shape, *, warn: bool = False) -> list[Mesh]:
     """Convex pieces [m]: the shape's own, or CoACD's, which are cut once for each mesh and then taken from the user's
     cache. With `warn`, a warning says so when that takes long. Raises SdfsimError if there are none."""
@@ -394,18 +403,20 @@ def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> lis
 def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
     file, (middle, radius) = GltfWriter(), framed(take.scene)
     file.origin = np.round(far_middle(middle + radius * np.array([[-1.0], [1.0]])))
-    # Bodies of the same shape and colour share a mesh; those of the same shape share its arrays.
-    arrays: dict[tuple[int, int], tuple[dict[str, int], int]] = {}
-    drawn: dict[tuple[str, tuple[int, int]], int] = {}
+    # Bodies of the same shape, size and colour share a mesh; those of the same shape and size share its arrays. Nodes
+    # have no scale, as the drafts of physics do not say whether it scales masses and velocities.
+    arrays: dict[Any, tuple[dict[str, int], int]] = {}
+    drawn: dict[tuple[str, Any], int] = {}
+    painted: dict[str, int] = {}
     time = file.array(take.time) if take.moving else 0
     samplers, channels = [], []
     for k, (name, body, shape, color) in enumerate(take.each()):
         seen = shown(take.scene, k, take.plane_size())
-        form = (body.shape, k if is_infinite(shape) else -1)  # planes differ by the scenery that lies in them
+        form = (body.shape, body.scale, k if is_infinite(shape) else -1)  # planes differ by what lies in them
         own = seen.colors is not None or seen.texture is not None
         if form not in arrays:
             mesh, normals = with_normals(seen)
-            attributes = {"POSITION": file.array(mesh.vertices), "NORMAL": file.array(normals)}
+            attributes = {"POSITION": file.array(body.scale * mesh.vertices), "NORMAL": file.array(normals)}
             if mesh.uv is not None:
                 attributes["TEXCOORD_0"] = file.array(mesh.uv)
             if mesh.colors is not None:  # in 16 bits: for linear light, 8 are too few for dark colours
@@ -414,12 +425,12 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
             arrays[form] = attributes, file.array(mesh.faces.reshape(-1), "<u4")
         key = take.shapes[body.shape] + ("" if own else "-{:02x}{:02x}{:02x}".format(*color))
         if (key, form) not in drawn:
-            material = file.material(
-                key, np.ones(3) if own else light(color), seen.texture, seen.maps, rough=0.8, lit=True
-            )
-            drawn[key, form] = file.mesh(key, *arrays[form], material)
+            if key not in painted:
+                tint = np.ones(3) if own else light(color)
+                painted[key] = file.material(key, tint, seen.texture, seen.maps, rough=0.8, lit=True)
+            drawn[key, form] = file.mesh(key, *arrays[form], painted[key])
         place, turn = take.position[:, k] - file.origin, take.quat_xyzw[:, k]
-        node = {"translation": place[0].tolist(), "rotation": turn[0].tolist(), "scale": [body.scale] * 3}
+        node = {"translation": place[0].tolist(), "rotation": turn[0].tolist()}
         file.nodes.append({"name": name, "mesh": drawn[key, form], **node})
         if take.moving and body.motion != "static":
             for path, values in (("translation", place), ("rotation", turn)):
@@ -427,11 +438,92 @@ def _glb(take: Take, out: Path, on_progress: StageProgress) -> Written:
                 samplers.append({"input": time, "output": file.array(values), "interpolation": "LINEAR"})
     if channels:
         file.animations.append({"name": "run", "samplers": samplers, "channels": channels})
+    left_out = _missing(take, motion=True, textures=True)
+    if take.moving:  # by the draft bodies then follow their motion; and Blender would show each collider
+        left_out.insert(0, "masses, friction and everything else that is not visible: the export of the scene has them")
+    else:
+        _gltf_physics(take, file)
+        left_out.insert(0, "gravity: glTF has none, programs use their own")
+        left_out += jointed.gltf_joints(file, take.scene, _joint_names(take)) if take.scene.joints else []
     write_bytes(out, file.to_bytes())
-    return [out], [
-        "masses, friction and everything else that is not visible",
-        *_missing(take, motion=True, textures=True),
-    ]
+    return [out], left_out
+
+
+def _gltf_physics(take: Take, file: GltfWriter) -> None:
+    """Add masses, velocities and colliders to the nodes of the bodies, which are the first ones, by the drafts of
+    KHR_physics_rigid_bodies and KHR_implicit_shapes of October 2025 (github.com/eoineoineoin/glTF_Physics)."""
+    forms: dict[Any, int] = {}
+    surfaces: dict[tuple[float, float], int] = {}
+    solids: dict[tuple[int, float], list[dict[str, Any]]] = {}
+    group, allowed = contact_groups(take.scene.bodies)
+    for k, (name, body, shape, _) in enumerate(take.each()):
+        physics: dict[str, Any] = {"motion": {"isKinematic": True}} if body.motion == "kinematic" else {}
+        if body.motion == "dynamic":
+            moments, axes = _principal(body, shape)
+            back = Rotation.from_quat(body.quat_xyzw).inv()  # the draft has velocities in the axes of the node
+            physics["motion"] = {
+                "mass": body.mass, "centerOfMass": (body.scale * shape.com).tolist(),
+                "inertiaDiagonal": moments.tolist(), "inertiaOrientation": axes.as_quat().tolist(),
+                "linearVelocity": back.apply(body.velocity).tolist(),
+                "angularVelocity": back.apply(body.angular_velocity).tolist(),
+            }  # fmt: skip
+        if isinstance(shape.sdf, ClosedForm):
+            geometries = [{"shape": forms.setdefault(shape.sdf.scaled(body.scale), len(forms))}]
+        elif body.motion != "dynamic":
+            geometries = [{"node": k}]
+        else:
+            if (size := (body.shape, body.scale)) not in solids:
+                solids[size] = _gltf_solids(file, take.shapes[body.shape], shape, body.scale)
+            geometries = solids[size] or [{"node": k}]
+        touch = {"physicsMaterial": surfaces.setdefault((body.friction, body.restitution), len(surfaces))}
+        touch |= {} if allowed.all() else {"collisionFilter": int(group[k])}
+        turn = {"rotation": UPRIGHT} if isinstance(shape.sdf, PlaneSdf | CapsuleSdf | CylinderSdf) else {}
+        for number, geometry in enumerate(geometries):
+            if len(geometries) == 1 and not turn:
+                physics["collider"] = {"geometry": geometry, **touch}
+                continue
+            own = {jointed.GLTF_PHYSICS: {"collider": {"geometry": geometry, **touch}}}
+            file.below(k, {"name": f"{name}-{number}", **turn, "extensions": own})
+        if physics:
+            file.nodes[k]["extensions"] = {jointed.GLTF_PHYSICS: physics}
+    if forms:
+        file.extensions["KHR_implicit_shapes"] = {"shapes": [_gltf_form(form) for form in forms]}
+    how = {"frictionCombine": "multiply", "restitutionCombine": "multiply"}
+    materials = [{"staticFriction": f, "dynamicFriction": f, "restitution": r, **how} for f, r in surfaces]
+    file.extensions[jointed.GLTF_PHYSICS] = {"physicsMaterials": materials}
+    if not allowed.all():
+        apart = [[f"group_{other}" for other in np.flatnonzero(~row)] for row in allowed]
+        filters = [
+            {"collisionSystems": [f"group_{g}"]} | ({"notCollideWithSystems": others} if others else {})
+            for g, others in enumerate(apart)
+        ]
+        file.extensions[jointed.GLTF_PHYSICS]["collisionFilters"] = filters
+
+
+def _gltf_form(form: Any) -> dict[str, Any]:
+    if isinstance(form, BoxSdf):
+        sizes: dict[str, Any] = {"size": [2.0 * half for half in form.half]}
+    elif isinstance(form, SphereSdf):
+        sizes = {"radius": form.radius}
+    elif isinstance(form, CapsuleSdf | CylinderSdf):
+        sizes = {"height": 2.0 * form.half, "radiusBottom": form.radius, "radiusTop": form.radius}
+    else:
+        sizes = {}
+    return {"type": form.KIND, form.KIND: sizes}
+
+
+def _gltf_solids(file: GltfWriter, name: str, shape: Shape, scale: float) -> list[dict[str, Any]]:
+    """The geometries of a moving body whose drawn mesh is not what touches: its convex pieces, or the closed mesh below
+    its skin."""
+    pieces, found = own_pieces(shape), []
+    for number, solid in enumerate(pieces or ([shape.mesh] if shape.skin is not None else [])):
+        called = f"{name}-solid_{number}"
+        corners = file.array(solid.faces.reshape(-1), "<u4")
+        mesh = file.mesh(called, {"POSITION": file.array(scale * solid.vertices)}, corners)
+        node = file.below(-1, {"name": called, "mesh": mesh})
+        file.aside.add(node)
+        found.append({"node": node} | ({"convexHull": True} if pieces else {}))
+    return found
 
 
 # --- USD ---
@@ -477,9 +569,8 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
             spin = np.rad2deg(body.angular_velocity)
             velocities = {"velocity": gf.Vec3f(*body.velocity.tolist()), "angularVelocity": gf.Vec3f(*spin.tolist())}
             _usd_apply(prim, "PhysicsRigidBodyAPI", **velocities)
-            diagonal, axes = np.linalg.eigh(_inertia(body, shape))
-            axes[:, 2] *= np.sign(np.linalg.det(axes))
-            com, turned = body.scale * shape.com, _wxyz(Rotation.from_matrix(axes).as_quat())
+            diagonal, axes = _principal(body, shape)
+            com, turned = body.scale * shape.com, _wxyz(axes.as_quat())
             masses = {"mass": body.mass, "centerOfMass": gf.Vec3f(*com.tolist())}
             masses |= {"diagonalInertia": gf.Vec3f(*diagonal.tolist()), "principalAxes": gf.Quatf(*turned.tolist())}
             _usd_apply(prim, "PhysicsMassAPI", **masses)
@@ -505,6 +596,8 @@ def _usd(take: Take, out: Path, on_progress: StageProgress) -> Written:
         solid.AddScaleOp().Set(gf.Vec3f(body.scale))
 
     group, allowed = contact_groups(take.scene.bodies)
+    if not allowed.all():
+        stage.DefinePrim("/World/groups", "Scope")
     for g in range(len(allowed) if not allowed.all() else 0):
         made = physics.CollisionGroup.Define(stage, f"/World/groups/group_{g}")
         for k in np.flatnonzero(group == g):
@@ -569,15 +662,16 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
 
 def _usd_mesh(stage: Any, path: str, mesh: Mesh) -> Any:
     geom, vt = _pxr("UsdGeom"), _pxr("Vt")
-    mesh, normals = with_normals(mesh)
-    prim = geom.Mesh.Define(stage, path)
-    prim.CreatePointsAttr(vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32)))
+    split, normals = with_normals(mesh)
+    prim, points = geom.Mesh.Define(stage, path), vt.Vec3fArray.FromNumpy(mesh.vertices.astype(np.float32))
+    prim.CreatePointsAttr(points)
+    prim.CreateExtentAttr(geom.PointBased.ComputeExtent(points))
     prim.CreateFaceVertexCountsAttr(vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, dtype=np.int32)))
     prim.CreateFaceVertexIndicesAttr(vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
     prim.CreateSubdivisionSchemeAttr(geom.Tokens.none)
     prim.CreateDoubleSidedAttr(True)
-    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals.astype(np.float32)))
-    prim.SetNormalsInterpolation(geom.Tokens.vertex)
+    prim.CreateNormalsAttr(vt.Vec3fArray.FromNumpy(normals[split.faces.reshape(-1)].astype(np.float32)))
+    prim.SetNormalsInterpolation(geom.Tokens.faceVarying)
     if mesh.colors is not None:
         tint = prim.CreateDisplayColorPrimvar(geom.Tokens.vertex)
         tint.Set(vt.Vec3fArray.FromNumpy(light(mesh.colors).astype(np.float32)))

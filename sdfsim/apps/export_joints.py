@@ -9,12 +9,14 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sdfsim.geometry.gltf import GltfWriter
 from sdfsim.physics.joint_space import spanning
 from sdfsim.scene.scene import Body, Joint, Scene
 
 NESTING = ("hinge", "slider", "ball", "fixed")  # kinds of joints by which one body can hold another in a tree
 KEEN = 20.0  # s/rad or s/m: gain of a motor, its largest force divided by the speed error at which it gives this force
 LEAST_TIME = 1e-3  # s: shorter times to a position give no larger stiffness
+GLTF_PHYSICS = "KHR_physics_rigid_bodies"
 EFFORT = 1e6  # N m or N, and rad/s or m/s: URDF requires limits, so these are given where there are none
 
 
@@ -106,8 +108,10 @@ def speed_of(scene: Scene, one: Held, child: int) -> np.ndarray:
     return turn.inv().apply(spin - turned) if one.joint.kind == "ball" else np.array(kinds.get(one.joint.kind, []))
 
 
-def left_out(scene: Scene, *, breaks: bool = True, mjcf: bool = False, spring_of: Sequence[str] = ()) -> list[str]:
-    """What only our own format has of joints, or also `mjcf`, one line each."""
+def left_out(
+    scene: Scene, *, breaks: bool = True, mjcf: bool = False, coupled: bool = True, spring_of: Sequence[str] = ()
+) -> list[str]:
+    """What only our own format has of joints, or also `mjcf` or formats with couplings, one line each."""
     joints = scene.joints
     lines = {
         "the loads at which joints break": breaks
@@ -115,6 +119,7 @@ def left_out(scene: Scene, *, breaks: bool = True, mjcf: bool = False, spring_of
         "the restitution of joints' limits": any(j.restitution for j in joints),
         "armature of joints": not mjcf and any(j.armature for j in joints),
         "keyframes": not mjcf and bool(scene.keyframes),
+        "couplings of joints": not coupled and bool(scene.couplings),
     }
     lines |= {f"springs of {kind}s": any(j.kind == kind and j.spring for j in joints) for kind in spring_of}
     return [line for line, there in lines.items() if there]
@@ -335,7 +340,7 @@ def usd_joints(
         "hinge": physics.RevoluteJoint, "slider": physics.PrismaticJoint, "ball": physics.SphericalJoint,
         "fixed": physics.FixedJoint, "distance": physics.DistanceJoint,
     }  # fmt: skip
-    lines = left_out(scene, breaks=False)
+    lines = left_out(scene, breaks=False, coupled=False)
     stage.DefinePrim("/World/joints", "Scope")
     for joint in scene.joints:
         made = made_of[joint.kind].Define(stage, f"/World/joints/{names[joint.name]}")
@@ -394,4 +399,63 @@ def _usd_drive(made: Any, physics: Any, joint: Joint, degrees: float) -> list[st
     if joint.spring is not None:
         drive.CreateStiffnessAttr(joint.spring.stiffness / degrees)
         drive.CreateTargetPositionAttr(joint.spring.rest * degrees)
+    return lines
+
+
+# --- glTF ---
+
+
+def gltf_joints(file: GltfWriter, scene: Scene, names: dict[str, str]) -> list[str]:
+    """Add joints of the draft KHR_physics_rigid_bodies between the first nodes, which are the bodies. The node of a
+    joint is in the body that holds, and the x axes of both nodes are the joint's. Returns what is left out."""
+    linear, angular, made = [0, 1, 2], [0, 1, 2], []
+    firm = {  # axes along and about which nothing moves
+        "hinge": (linear, [1, 2]), "slider": ([1, 2], angular), "ball": (linear, []), "fixed": (linear, angular),
+        "distance": ([], []),
+    }  # fmt: skip
+    free = {
+        "hinge": ("angular", [0]),
+        "slider": ("linear", [0]),
+        "ball": ("angular", [1, 2]),
+        "distance": ("linear", linear),
+    }
+    lines = left_out(scene, coupled=False)
+    for joint in scene.joints:
+        ends = []
+        for side, body in enumerate(joint.bodies):
+            place = joint.anchor[side] - (file.origin if body < 0 else 0.0)
+            frame = {"translation": place.tolist(), "rotation": joint.quat_xyzw[side].tolist()}
+            ends.append(file.below(body, {"name": f"{names[joint.name]}-{side}", **frame}))
+        held_by = {"connectedNode": ends[0], "joint": len(made), "enableCollision": joint.collides}
+        file.nodes[ends[1]]["extensions"] = {GLTF_PHYSICS: {"joint": held_by}}
+        limits: list[dict[str, Any]] = [
+            {f"{kind}Axes": axes, "min": 0.0, "max": 0.0}
+            for kind, axes in zip(("linear", "angular"), firm[joint.kind], strict=True)
+            if axes
+        ]
+        kind, axes = free.get(joint.kind, ("", []))
+        reach = joint.limits if joint.length is None else (joint.length, joint.length)
+        if reach is not None:
+            limits.append({f"{kind}Axes": axes, "min": reach[0], "max": reach[1]})
+        drives: list[dict[str, Any]] = []
+        spring = joint.spring
+        if joint.kind == "distance" and spring is not None:  # a limit that is soft
+            soft = {"stiffness": spring.stiffness, "damping": joint.damping}
+            limits.append({"linearAxes": linear, "min": spring.rest, "max": spring.rest, **soft})
+        elif joint.kind == "distance" and joint.damping:
+            lines.append(f"damping of joint {joint.name}")
+        elif joint.kind != "distance":
+            if spring is not None:
+                drives.append({"axis": 0, "positionTarget": spring.rest, "stiffness": spring.stiffness})
+            dragged = angular if joint.kind == "ball" else [0]
+            drives += [{"axis": a, "velocityTarget": 0.0, "damping": joint.damping} for a in dragged if joint.damping]
+        if joint.motor is not None and (joint.motor.speed is not None or joint.motor.position is not None):
+            kp, kv = gains(joint)
+            goal = {"maxForce": joint.motor.max_force, "velocityTarget": joint.motor.speed or 0.0, "damping": kv}
+            goal |= {} if joint.motor.position is None else {"positionTarget": joint.motor.position, "stiffness": kp}
+            drives.append({"axis": 0, **goal})
+        drives = [{"type": kind, "mode": "force", **drive} for drive in drives]
+        made.append({"name": names[joint.name], "limits": limits, **({"drives": drives} if drives else {})})
+        lines += [f"friction of joint {joint.name}"] if joint.friction else []
+    file.extensions[GLTF_PHYSICS]["physicsJoints"] = made
     return lines

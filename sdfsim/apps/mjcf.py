@@ -111,7 +111,7 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
     """The bodies and joints of an MJCF file, in the keyframe `key`, or else in one called start, or in the file's
     initial pose. Raises SdfsimError if MuJoCo is not installed or refuses the file, if there is no such keyframe, or
     for geometry that a body cannot have."""
-    mujoco = optional("mujoco", "mujoco", "mjcf")
+    mujoco = optional("mujoco", "mujoco", "export")
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, RuntimeError) as error:

@@ -108,7 +108,7 @@ def cluster(address: str | None) -> Iterator[None]:
     try:
         from distributed import Client
     except ImportError as error:
-        raise SdfsimError("a cluster needs Dask", "pip install 'sdfsim[cluster]'") from error
+        raise SdfsimError("a cluster needs Dask", "pip install 'sdfsim[learn]'") from error
     try:
         client = Client(address, timeout=SCHEDULER_ANSWERS)
     except (OSError, TimeoutError, ValueError) as error:

@@ -58,10 +58,19 @@ class GltfWriter:
         self.meshes: list[dict[str, Any]] = []
         self.materials: list[dict[str, Any]] = []
         self.animations: list[dict[str, Any]] = []
+        self.extensions: dict[str, dict[str, Any]] = {}  # of the file
+        self.aside: set[int] = set()  # nodes that are not part of the scene
         self._images: list[dict[str, Any]] = []
         self._accessors: list[dict[str, Any]] = []
         self._views: list[dict[str, Any]] = []
         self._content = bytearray()
+
+    def below(self, parent: int, node: dict[str, Any]) -> int:
+        """Add a node below another one, or below the one above all (-1), and return its index."""
+        self.nodes.append(node)
+        if parent >= 0:
+            self.nodes[parent].setdefault("children", []).append(len(self.nodes) - 1)
+        return len(self.nodes) - 1
 
     def _view(self, data: bytes) -> int:
         self._views.append({"buffer": 0, "byteOffset": len(self._content), "byteLength": len(data)})
@@ -118,12 +127,14 @@ class GltfWriter:
         self._images.append({"bufferView": self._view(file.getvalue()), "mimeType": f"image/{kind.lower()}"})
         return {"index": len(self._images) - 1}
 
-    def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int) -> int:
-        """Add a mesh from accessors: the attributes of its vertices, and the corners of its faces."""
+    def mesh(self, name: str, attributes: dict[str, int], corners: int, material: int | None = None) -> int:
+        """Add a mesh from accessors: the attributes of its vertices, and the corners of its faces. One that is not
+        drawn needs no material."""
         for accessors, target in ((attributes.values(), _VERTICES), ([corners], _CORNERS)):
             for accessor in accessors:
                 self._views[self._accessors[accessor]["bufferView"]]["target"] = target
-        drawn = {"attributes": attributes, "indices": corners, "material": material}
+        drawn: dict[str, Any] = {"attributes": attributes, "indices": corners}
+        drawn |= {} if material is None else {"material": material}
         self.meshes.append({"name": name, "primitives": [drawn]})
         return len(self.meshes) - 1
 
@@ -133,12 +144,15 @@ class GltfWriter:
         lists = {"meshes": self.meshes, "materials": self.materials, "images": self._images}
         lists |= {"accessors": self._accessors, "bufferViews": self._views, "animations": self.animations}
         lists |= {"textures": [{"source": k} for k in range(len(self._images))]}
-        lists |= {"extensionsUsed": [_UNLIT] if any("extensions" in one for one in self.materials) else []}
+        used = [_UNLIT] if any("extensions" in one for one in self.materials) else []
+        lists |= {"extensionsUsed": [*used, *self.extensions], "extensions": self.extensions}
+        under = self.aside.union(*(node.get("children", ()) for node in self.nodes))
+        top = [k for k in range(count) if k not in under]
         header = {
             "asset": {"version": "2.0", "generator": "sdfsim"},
             "scene": 0,
             "scenes": [{"nodes": [count]}],
-            "nodes": [*self.nodes, {"name": "root", "children": list(range(count)), "matrix": [*_Y_UP, x, z, -y, 1]}],
+            "nodes": [*self.nodes, {"name": "root", "children": top, "matrix": [*_Y_UP, x, z, -y, 1]}],
             "buffers": [{"byteLength": len(self._content)}],
             **{name: entries for name, entries in lists.items() if entries},
         }

@@ -42,7 +42,7 @@ def test_what_is_not_installed_is_told_with_what_it_is_for(monkeypatch):
         "pi-heif: pip install pi-heif",
         "xatlas: pip install xatlas",
         "usd-core, for export of .usd: pip install 'sdfsim[export]'",
-        "mujoco, for import of MJCF, and comparisons with MuJoCo: pip install 'sdfsim[mjcf]'",
+        "mujoco, for import of MJCF, and comparisons with MuJoCo: pip install 'sdfsim[export]'",
     ]
     shown = run("info").stdout
     assert all(f"not here: {line}" in shown for line in told) and "usd-core missing" not in shown

@@ -1,8 +1,13 @@
-"""Exports, read back by the programs that they are for: trimesh, OpenUSD, MuJoCo, PyBullet, and our own `identify`."""
+"""Exports, read back by the programs that they are for: trimesh, OpenUSD, MuJoCo, PyBullet, and our own `identify`; and
+judged by the validators of Khronos, OpenUSD and NVIDIA."""
 
 import csv
 import json
+import os
+import shutil
 import struct
+import subprocess
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -164,7 +169,7 @@ def test_vertex_colours_are_kept_as_light(tmp_path):
     replace(shape, mesh=replace(shape.mesh, colors=colors)).save(tmp_path / "shape")
     export(tmp_path / "shape", tmp_path / "shape.glb")
     tree, binary = chunks(tmp_path / "shape.glb")
-    (mesh,) = tree["meshes"]
+    mesh = tree["meshes"][0]  # the others are its convex pieces
     accessor = tree["accessors"][mesh["primitives"][0]["attributes"]["COLOR_0"]]
     assert (accessor["componentType"], accessor["normalized"]) == (5123, True)
     start = tree["bufferViews"][accessor["bufferView"]]["byteOffset"]
@@ -180,7 +185,7 @@ def test_a_texture_lies_where_it_lay(tmp_path):
     texture[:16, :32] = (200, 40, 40)
     replace(shape, skin=replace(shape.mesh, uv=uv, texture=texture)).save(tmp_path / "shape")
     export(tmp_path / "shape", tmp_path / "shape.glb")
-    (found,) = trimesh.load_scene(tmp_path / "shape.glb").geometry.values()
+    found = next(iter(trimesh.load_scene(tmp_path / "shape.glb").geometry.values()))  # then its convex pieces
     np.testing.assert_allclose(
         found.visual.to_color().vertex_colors[:5, :3] > 100, np.outer((uv[:5] < 0.5).all(1), (1, 0, 0))
     )
@@ -188,7 +193,121 @@ def test_a_texture_lies_where_it_lay(tmp_path):
     tree, _ = chunks(tmp_path / "shape.glb")
     assert tree["images"][0]["mimeType"] == "image/jpeg"
     # Lamps and shadows of other programs fall on it.
-    assert "extensionsUsed" not in tree and "extensions" not in tree["materials"][0]
+    assert "KHR_materials_unlit" not in tree["extensionsUsed"] and "extensions" not in tree["materials"][0]
+
+
+def test_a_glb_has_the_masses_the_colliders_and_the_surfaces(dropped):
+    tree, _ = chunks(dropped.export("scene.glb", motion=False))
+    physics, shapes = (tree["extensions"][f"KHR_{name}"] for name in ("physics_rigid_bodies", "implicit_shapes"))
+    node_of = {node["name"]: node for node in tree["nodes"]}
+
+    def own(node: dict) -> dict:
+        return node["extensions"]["KHR_physics_rigid_bodies"]
+
+    def colliders(name: str) -> list[tuple[dict, dict]]:
+        """The nodes of a body that have a collider, with it."""
+        nodes = [node_of[name], *(tree["nodes"][k] for k in node_of[name].get("children", ()))]
+        return [(node, own(node)["collider"]) for node in nodes if "collider" in node.get("extensions", {}).get(
+            "KHR_physics_rigid_bodies", {})]  # fmt: skip
+
+    def form(name: str) -> dict:
+        ((node, made),) = colliders(name)
+        found = shapes["shapes"][made["geometry"]["shape"]]
+        if found["type"] in ("plane", "capsule", "cylinder"):  # along y there, along z here
+            np.testing.assert_allclose(Rotation.from_quat(node["rotation"]).apply([0, 1, 0]), [0, 0, 1], atol=1e-12)
+        return found
+
+    names = {"1 box": "_1_box", "the ring": "the_ring"}
+    for name in ("the ring", "cone", "1 box", "slider"):
+        body, node = dropped.scene.bodies[dropped.index(name)], node_of[names.get(name, name)]
+        motion, turn = own(node)["motion"], Rotation.from_quat(node["rotation"])
+        axes = Rotation.from_quat(motion["inertiaOrientation"]).as_matrix()
+        inertia = axes @ np.diag(motion["inertiaDiagonal"]) @ axes.T
+        np.testing.assert_allclose(inertia, dropped.inertia(name), atol=1e-9 * np.abs(inertia).max())
+        assert "scale" not in node and motion["mass"] == pytest.approx(body.mass)
+        assert motion["centerOfMass"] == pytest.approx(body.scale * dropped.scene.shapes[body.shape].com)
+        assert turn.apply(motion["linearVelocity"]) == pytest.approx(body.velocity)
+        assert turn.apply(motion["angularVelocity"]) == pytest.approx(body.angular_velocity)
+        surface = physics["physicsMaterials"][colliders(names.get(name, name))[0][1]["physicsMaterial"]]
+        assert (surface["dynamicFriction"], surface["restitution"]) == (body.friction, body.restitution)
+        assert surface["frictionCombine"] == surface["restitutionCombine"] == "multiply"
+    assert own(node_of["sweep"])["motion"] == {"isKinematic": True} and "motion" not in own(node_of["bowl"])
+    assert form("floor") == {"type": "plane", "plane": {}}
+    assert form("ball") == {"type": "sphere", "sphere": {"radius": 0.05}}
+    assert form("_1_box")["box"]["size"] == pytest.approx([0.1, 0.08, 0.06])
+    for name, height in (("pill", 0.04), ("can", 0.08)):  # of the pill without its ends
+        made = form(name)
+        assert made[made["type"]] == pytest.approx({"height": height, "radiusBottom": 0.03, "radiusTop": 0.03})
+    pieces = [made["geometry"] for _, made in colliders("the_ring")]
+    assert len(pieces) == 32 and all(piece["convexHull"] for piece in pieces)
+    assert not {piece["node"] for piece in pieces} & set(tree["nodes"][-1]["children"])  # they are not drawn
+    assert colliders("bowl")[0][1]["geometry"] == {"node": list(node_of).index("bowl")}
+    filters = [
+        physics["collisionFilters"][colliders(name)[0][1]["collisionFilter"]] for name in ("pill", "can", "floor")
+    ]
+    (pill, can, floor) = ((one["collisionSystems"], one.get("notCollideWithSystems", [])) for one in filters)
+    assert set(pill[0]) <= set(can[1]) and set(can[0]) <= set(pill[1]) and floor[1] == []
+
+
+CHECK = """
+const [checked, files] = [require('gltf-validator'), require('fs')]
+checked.validateBytes(new Uint8Array(files.readFileSync(process.argv[1])))
+  .then(report => console.log(JSON.stringify(report.issues)))
+"""
+
+
+@pytest.mark.slow
+def test_khronos_validator_finds_no_fault_in_a_glb(dropped, tmp_path):
+    node = shutil.which("node")
+    if node is None or subprocess.run([node, "-e", "require('gltf-validator')"], capture_output=True).returncode:
+        pytest.skip("no gltf-validator (npm install -g gltf-validator; export NODE_PATH=$(npm root -g))")
+
+    def faults(path: Path) -> int:
+        done = subprocess.run([node, "-e", CHECK, path], check=True, capture_output=True, text=True)
+        issues = json.loads(done.stdout)
+        return issues["numErrors"] + issues["numWarnings"]
+
+    for sample in ("cart", "ragdoll"):  # a texture; joints
+        export(sample, tmp_path / f"{sample}.glb")
+        assert faults(tmp_path / f"{sample}.glb") == 0
+    moving = dropped.export("run.glb")
+    assert faults(moving) == 0
+    (tmp_path / "bad.glb").write_bytes(moving.read_bytes().replace(b'"LINEAR"', b'"BEZIER"'))
+    assert faults(tmp_path / "bad.glb") > 0
+
+
+@pytest.mark.slow
+def test_blender_opens_a_run_with_the_add_on(dropped):
+    if not (python := os.environ.get("BLENDER_PYTHON")):
+        pytest.skip("BLENDER_PYTHON names no Python with bpy: see scripts/blender_check.py")
+    script = SHAPES.parents[1] / "scripts" / "blender_check.py"
+    done = subprocess.run([python, script, dropped.folder, Path(sys.executable).with_name("sdfsim")], text=True)
+    assert done.returncode == 0
+
+
+@pytest.mark.slow
+def test_validators_of_usd_find_no_fault(dropped, tmp_path):
+    from pxr import Usd, UsdPhysics, UsdValidation
+
+    every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    for sample in ("cart", "ragdoll"):
+        export(sample, tmp_path / f"{sample}.usdc")
+    files = [dropped.export("run.usdc"), tmp_path / "cart.usdc", tmp_path / "ragdoll.usdc"]
+    for file in files:
+        stage = Usd.Stage.Open(str(file))
+        assert UsdValidation.ValidationContext(every).Validate(stage) == []
+    UsdPhysics.Joint(stage.GetPrimAtPath("/World/joints/neck")).GetBody0Rel().SetTargets(["/World/nobody"])
+    assert UsdValidation.ValidationContext(every).Validate(stage)
+
+
+@pytest.mark.slow
+def test_nvidia_s_validator_finds_no_fault_in_a_usd(dropped, tmp_path):
+    """With the rules of simready-validate's own validator, which are not those of SimReady's catalogue of assets."""
+    checked = pytest.importorskip("usd_validation_nvidia", reason="pip install simready-validate")
+    export("ragdoll", tmp_path / "ragdoll.usdc")
+    for file in (dropped.export("run.usdc"), tmp_path / "ragdoll.usdc"):
+        issues = checked.ValidationEngine().validate(str(file)).issues()
+        assert [issue.message for issue in issues if issue.severity.name != "WARNING"] == []
 
 
 def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):

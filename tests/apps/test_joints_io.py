@@ -1,5 +1,6 @@
 """Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -631,6 +632,50 @@ def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
     assert slider.GetMaxForceAttr().Get() == pytest.approx(20) and slider.GetTargetPositionAttr().Get() == (
         pytest.approx(0.4)
     )
+
+
+def test_gltf_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
+    """By the metrics in the draft's appendix: of the connected node, seen from the node of the joint."""
+    scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
+    export(tmp_path / "scene.yaml", tmp_path / "out.glb")
+    content = (tmp_path / "out.glb").read_bytes()
+    tree = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    above = {child: k for k, node in enumerate(tree["nodes"]) for child in node.get("children", ())}
+
+    def pose(k: int) -> tuple[np.ndarray, Rotation]:
+        node = tree["nodes"][k]
+        if "matrix" in node:  # the root
+            return np.zeros(3), Rotation.identity()
+        place, turn = pose(above[k])
+        own = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1)))
+        return place + turn.apply(node["translation"]), turn * own
+
+    made = tree["extensions"]["KHR_physics_rigid_bodies"]["physicsJoints"]
+    found = {}
+    for k, node in enumerate(tree["nodes"]):
+        if joint := node.get("extensions", {}).get("KHR_physics_rigid_bodies", {}).get("joint"):
+            (here, one), (there, two) = pose(k), pose(joint["connectedNode"])
+            told = made[joint["joint"]]
+            found[told["name"]] = one.inv().apply(there - here), (one.inv() * two).as_rotvec(), told
+            assert not joint["enableCollision"]
+    assert set(found) == {joint.name for joint in scene.joints}
+    for name, (moved, turned, told) in found.items():
+        for limit in told["limits"]:
+            along, about = limit.get("linearAxes", []), limit.get("angularAxes", [])
+            far = [moved[along[0]]] if len(along) == 1 else [np.linalg.norm(moved[along])] if along else turned[about]
+            assert all(limit["min"] - 1e-6 <= value <= limit["max"] + 1e-6 for value in far), name
+        if name in ("shoulder", "elbow", "track"):
+            assert (turned + moved)[0] == pytest.approx(start_positions(scene)[name], abs=1e-6)
+    shoulder, track, string = (found[name][2] for name in ("shoulder", "track", "string"))
+    (swing,) = [limit for limit in shoulder["limits"] if limit.get("angularAxes") == [0]]
+    assert (swing["min"], swing["max"]) == pytest.approx((math.radians(-30), math.radians(70)))
+    spring, drag = shoulder["drives"]
+    assert spring == {"type": "angular", "mode": "force", "axis": 0, "stiffness": 3.0,
+                      "positionTarget": pytest.approx(math.radians(10))}  # fmt: skip
+    assert (drag["velocityTarget"], drag["damping"]) == (0.0, 0.2)
+    (motor,) = track["drives"]
+    assert (motor["type"], motor["maxForce"], motor["positionTarget"]) == ("linear", 20.0, 0.4)
+    assert string["limits"] == [{"linearAxes": [0, 1, 2], "min": 0.0, "max": pytest.approx(1.2)}]
 
 
 def test_the_command_imports(tmp_path: Path) -> None:
