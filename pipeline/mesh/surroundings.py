@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import Delaunay, KDTree
+from scipy.spatial import ConvexHull, Delaunay, KDTree
 
 from pipeline.cameras import View, frame_of
 from pipeline.mesh.extraction import RIM, Volume, islands, keep_faces, trusted_vertices
@@ -25,8 +25,9 @@ FACING = (
     0.7  # cosine of the angle between the normals of a surface and its plane, at least; of different planes, at most
 )
 PLANES, SHARE = 8, 0.03  # planes at most, and the least share of the seen surface on one
+FILLED = 0.36  # share of a plane, within the hull of what is seen of it, that has to be seen
 BELOW = 0.05  # cells, of the room's floor below the scenery's
-THROUGH = 6.0  # cells of air on both sides, from which on a plane is not there
+THROUGH = 4.0  # cells of air on both sides, from which on a plane is not there
 FURNITURE = 0.1  # of the surface that lies on no plane: smaller patches are ignored
 FEWEST = 100  # vertices that photos show: less is not worth showing
 
@@ -66,6 +67,7 @@ def surroundings_of(
     if floor is not None and abs(height(planes[floor].middle[None])[0]) < NEAR * cell:
         # Just below the scenery's floor, so that both are not in one plane.
         planes[floor] = Plane(up, -(height(np.zeros((1, 3)))[0] + BELOW * cell) * up)
+    planes = [plane for plane in planes if filled_share(plane, raw.vertices[seen], cell) > FILLED]
     on = np.any([plane.near(raw.vertices, cell) for plane in planes] or [np.zeros(len(seen), bool)], axis=0)
     # Noise at the rims of what photos show floats before the walls: fewer photos agree on it.
     sure = seen & ~on & (found.count >= FEW)
@@ -120,6 +122,14 @@ def find_planes(points: np.ndarray, normals: np.ndarray, cell: float) -> list[Pl
         found.append(plane)
         left = left[~plane.near(points[left], cell)]
     return found
+
+
+def filled_share(plane: Plane, seen: np.ndarray, cell: float) -> float:
+    """The share of the convex hull of a plane's points, among points [P, 3], that these fill: clutter through which a
+    plane can be laid leaves gaps."""
+    flat = (seen[plane.near(seen, cell)] - plane.middle) @ frame_of(plane.normal)[:2].T
+    places = np.unique(np.floor(flat / (2 * cell)).astype(int), axis=0)
+    return len(places) * (2 * cell) ** 2 / ConvexHull(flat).volume
 
 
 def sheet(plane: Plane, planes: Sequence[Plane], seen: np.ndarray, volume: Volume) -> Mesh:
