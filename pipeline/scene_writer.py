@@ -34,7 +34,7 @@ from sdfsim.sdf.far_field import BOX
 from sdfsim.sdf.sdf import Sdf
 
 SAMPLES, BLOCK = (65, 161), 4  # fewest and most along a side of a grid; cells per side of a block sampled at once
-AROUND = 97  # samples a side of the room around, whose walls are flat
+AROUND = 65  # samples a side of the room around, whose walls are flat
 SCENERY_SHARE = 2  # The scenery gets the budget of this many bodies, because it has more detail.
 SIDE = 0.06  # of the dropped slab, as a share of the scenery's widest side
 THICKNESS = 0.5  # of the slab, as a share of its side; a cube tips over more easily

@@ -48,7 +48,7 @@ from pipeline.mesh.symmetry import complete as completed
 from pipeline.mesh.trust import evidence_of
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.bvh import Caster
+from sdfsim.geometry.bvh import Caster, ClosestPoint
 from sdfsim.geometry.mesh import Mesh, face_normals
 
 # Shares, without unit, set by hand on the rendered sets (table with a vase, `touching`, `shelf`) together, unless one
@@ -411,6 +411,7 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         return Parts(surface.solid, surface.visible, {}, smallest, missing=names)
     noise = _noise(sampled, poses.sparse.xyz, finest)
     called = _names([body for body in sampled if body not in noise])
+    grown: list[tuple[FoundBody, Mesh]] = []
     meshes, unrefined, symmetries, pictures = {}, {}, {}, load_grey_photos(poses.views, photos_folder)
     for body, name in called.items():
         # Lifted off the occluding surface, which is sampled more coarsely.
@@ -421,13 +422,14 @@ def split(surface: FieldSurface, distance: Distance, finest: float, poses: Posed
         whole_of = completed(Known(mesh, evidence_of(sight, poses.views), poses.views, blocking, finest), up)
         if whole_of is not None:
             mesh, symmetries[name] = whole_of.mesh, (whole_of.symmetry.name, whole_of.guessed)
+            grown.append((body, mesh))
             sight = Visibility(mesh, lift, blocking)
         seen = look(sight, poses.views, photos_folder)
         known, color = seen.weight > 0, seen.color
         if known.any() and not known.all():
             color[~known] = spread_colors(mesh.vertices[~known], mesh.vertices[known], color[known])
         meshes[name] = replace(mesh, colors=to_bytes(color))
-    solid, shown = (None, None) if alone else scenery(surface, whole, distance)
+    solid, shown = (None, None) if alone else scenery(surface, whole, distance, grown)
     pairs = [(called[a], called[b], by) for a, b, by in touching if a in called and b in called]
     missing = [name for name in names if name not in meshes]
     return Parts(
@@ -589,9 +591,31 @@ def whole_bodies(surface: FieldSurface) -> dict[str, Mesh]:
     return {f"object{n}": keep_faces(solid, label == k) for n, k in enumerate(order, start=1)}
 
 
-def scenery(surface: FieldSurface, bodies: list[FoundBody], distance: Distance) -> tuple[Mesh, Mesh]:
-    """The scenery's solid without bodies, and its displayed mesh."""
-    raw, mesh = surface.raw, without_bodies(surface.volume, bodies, distance).mesh()
+def emptied(volume: Volume, grown: list[tuple[FoundBody, Mesh]]) -> Volume:
+    """The scenery without what lies above the planes of bodies within their completed meshes, such as a shard in a hole
+    of a floor that the completion has closed."""
+    values = volume.values.copy()
+    for body, mesh in grown:
+        low, high = mesh.vertices.min(0) - 2 * volume.cell, mesh.vertices.max(0) + 2 * volume.cell
+        start = np.maximum(np.floor((low - volume.low) / volume.cell).astype(int), 0)
+        stop = np.minimum(np.ceil((high - volume.low) / volume.cell).astype(int) + 1, values.shape)
+        box = tuple(slice(a, b) for a, b in zip(start, stop, strict=True))
+        part = replace(volume, values=values[box], low=volume.low + volume.cell * start)
+        points = part.points().reshape(-1, 3)
+        height, nearest = body.level.above(points), ClosestPoint(mesh)
+        over = np.flatnonzero((height > 0) & np.isfinite(height))
+        away = np.linalg.norm(points[over] - nearest(points[over])[0], axis=1)
+        over = over[nearest.odd(points[over]) | (away < volume.cell)]
+        inside = part.values.reshape(-1).copy()
+        inside[over] = np.maximum(inside[over], np.minimum(height[over], volume.cell))
+        values[box] = inside.reshape(part.values.shape)
+    return replace(volume, values=values)
+
+
+def scenery(surface: FieldSurface, bodies: list[FoundBody], distance: Distance,
+            grown: list[tuple[FoundBody, Mesh]]) -> tuple[Mesh, Mesh]:  # fmt: skip
+    """The scenery's solid without bodies, of which some have `grown` by completion, and its displayed mesh."""
+    raw, mesh = surface.raw, emptied(without_bodies(surface.volume, bodies, distance), grown).mesh()
     assert raw.colors is not None
     # Away from cuts, the vertices are those of the whole surface, and take its attributes.
     away, nearest = KDTree(raw.vertices).query(mesh.vertices)

@@ -36,7 +36,7 @@ from sdfsim.geometry.mesh_io import read_attributes, read_mesh, write_glb, write
 
 TEXTURED, NEXT = "textured.glb", "next_photos.json"
 SHOWN_AROUND, SOLID_AROUND = "surroundings.ply", "surroundings_solid.ply"
-ROUGH = 20_000  # faces of the room around that bodies meet: it is no finer than its cells
+ROUGH = 8_000  # faces of the room around that bodies meet: it is no finer than its cells
 RESOLUTION = {"quick": 256, "standard": 320}  # samples per side, by preset
 # The picture of names: largest number of photos, their width while they are chosen and in the picture, px, and the
 # tint.

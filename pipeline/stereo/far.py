@@ -18,7 +18,7 @@ from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.base.parallel import Progress, silent
 
 FILE = "surroundings.npz"  # in the folder of the field: the signed distance
-SIDE = 128  # samples a side
+SIDE = 96  # samples a side
 FARTHEST = 10.0  # radii of the ball: what is farther away is not solid enough to be met
 MOST = 0.98  # of the places outside of the ball lie within the sampled cube
 LEAST = 0.02  # share of the photos' depth that lies outside: with less there is nothing to show

@@ -1,9 +1,12 @@
 """What photos do not show of a body is completed by its symmetry, and never against what they show."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from pipeline.cameras import View
+from pipeline.mesh.bodies import LevelPlane, emptied
 from pipeline.mesh.extraction import sample_box
 from pipeline.mesh.symmetry import MIRROR, REVOLUTION, Known, complete
 from pipeline.mesh.trust import camera_at, evidence_of
@@ -143,3 +146,18 @@ def test_a_body_that_photos_show_from_everywhere_stays_as_it_is():
     ball = solid(lambda p: np.linalg.norm(p - [0, 0, 0.25], axis=1) - 0.25)
     below = [camera_at(view.center * [1, 1, -1], np.array([0.0, 0, 0.25]), LENS) for view in ring(12, 0, 330, 1.5)]
     assert complete(known(ball, ring(16, 0, 337, 0.5) + ring(10, 0, 324, 1.8, 1.0) + below), UP) is None
+
+
+def test_the_scenery_is_empty_where_a_completed_body_is():
+    """A shard of the table stuck in a hole of the body's floor, which its completion has closed."""
+    table = lambda p: np.maximum(p[:, 2], -0.08 - p[:, 2])  # noqa: E731
+    shard = lambda p: box(p, [-0.05, -0.05, -0.02], [0.05, 0.05, 0.06])  # noqa: E731
+    volume = sample_box(
+        lambda p: np.minimum(table(p), shard(p)), np.array([-0.5, -0.5, -0.1]), np.array([0.5, 0.5, 0.5]), CELL
+    )
+    body = solid(lambda p: box(p, [-0.2, -0.2, 0.0], [0.2, 0.2, 0.3]))
+    stands = SimpleNamespace(level=LevelPlane(UP, 0.0, 1.0))
+    left = emptied(volume, [(stands, body)]).mesh()  # type: ignore[list-item]
+    assert volume.mesh().vertices[:, 2].max() > 0.05 and left.vertices[:, 2].max() < 0.5 * CELL
+    away = np.abs(volume.at(left.vertices))
+    assert (away[np.abs(left.vertices[:, :2]).max(1) > 0.25] < 1e-3).all()
