@@ -95,8 +95,8 @@ def make_meshes(
     around = None
     if not alone and options.crop is None and (far := load_far(distill)) is not None:
         on_progress(0.81, "looking at the room around")
-        inner = [mesh for mesh in (parts.solid, *parts.bodies.values()) if mesh is not None]
-        around = surroundings_of(far, placement.height, inner, posed.views, photos)
+        within = [mesh for mesh in (parts.solid, *parts.bodies.values()) if mesh is not None]
+        around = surroundings_of(far, placement.height, within, posed.views, photos)
     whole = joined(list(closed.values()))
     views = posed.moved(placement.to_metres).views
     shots = shots_of(views, load_photos(photos), photos, list(closed.values()), surface.volume.cell * metres)

@@ -154,7 +154,8 @@ def sheet(plane: Plane, planes: Sequence[Plane], seen: np.ndarray, volume: Volum
     rows, columns = np.nonzero(wanted.reshape(middles.shape[:2]))
     first = rows * len(b) + columns
     quads = np.stack([first, first + len(b), first + len(b) + 1, first + 1], 1)
-    return keep_faces(Mesh(corners.reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)), slice(None))
+    made = Mesh(corners.reshape(-1, 3), quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+    return keep_faces(made, np.ones(len(made.faces), bool))
 
 
 def up_of(height: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

@@ -193,7 +193,7 @@ def complete(known: Known, up: np.ndarray) -> Completed | None:
         return None
     axis, found = axis_of(known, up), []
     unseen = known.mesh.vertices[~known.seen]
-    for symmetry in [axis] * (axis is not None) + mirrors_of(known, up):
+    for symmetry in ([] if axis is None else [axis]) + mirrors_of(known, up):
         wrong, shared = known.agreement(symmetry, np.random.default_rng(0))
         if wrong < WRONG and shared > SHARED:
             found.append((max(known.trust.at(image).mean() for image in symmetry.images(unseen)), symmetry))
@@ -207,7 +207,7 @@ def filled(known: Known, symmetry: Symmetry, up: np.ndarray) -> Completed:
     does not reach below itself, where its support is."""
     most, vertices = FLAT * known.cell, known.mesh.vertices
     reach = symmetry.images(vertices[known.seen]).reshape(-1, 3)
-    volume, trust = (grown(part, reach, mode) for part, mode in ((known.volume, "edge"), (known.trust, "constant")))
+    volume, trust = grown(known.volume, reach, "edge"), grown(known.trust, reach, "constant")
     points, own = volume.points().reshape(-1, 3), trust.values.ravel()
     values = volume.values.ravel().clip(-most, most)
     if symmetry.name == MIRROR:
@@ -219,7 +219,8 @@ def filled(known: Known, symmetry: Symmetry, up: np.ndarray) -> Completed:
     values = np.maximum(values, (vertices @ up).min() - points @ up)
     values = values.reshape(volume.values.shape).astype(np.float32)
     # What is deep inside is known of no image; a new surface encloses it.
-    values[ndimage.binary_fill_holes(values < 0) & (values >= 0)] = -known.cell
+    whole = np.asarray(ndimage.binary_fill_holes(values < 0))
+    values[whole & (values >= 0)] = -known.cell
     made = replace(volume, values=values).mesh()
     label = components(made)
     size = np.bincount(label, face_normals(made)[1])
