@@ -1,9 +1,8 @@
 """Named materials: how heavy, how rough and how bouncy a body is, and where each number comes from."""
 
+import math
 import re
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 
@@ -94,7 +93,7 @@ def materials_of(given: dict[str, str], masses: dict[str, float] | None = None) 
     for body, mass in (masses or {}).items():
         if body in UNMOVED:
             raise SdfsimError(f"mass: {body}: does not move, so its mass does not matter")
-        if not 0 < mass < np.inf:
+        if not 0 < mass < math.inf:
             raise SdfsimError(f"mass: {body}: must be more than 0 kg (got {mass:g})")
         found[body] = replace(found.get(body, Choice()), mass=mass)
     return found
