@@ -25,6 +25,7 @@ FACING = (
     0.7  # cosine of the angle between the normals of a surface and its plane, at least; of different planes, at most
 )
 PLANES, SHARE = 8, 0.03  # planes at most, and the least share of the seen surface on one
+# FILLED and THROUGH were chosen on the bundled room and on 25 photos of a kitchen.
 FILLED = 0.36  # share of a plane, within the hull of what is seen of it, that has to be seen
 BELOW = 0.05  # cells, of the room's floor below the scenery's
 THROUGH = 4.0  # cells of air on both sides, from which on a plane is not there
