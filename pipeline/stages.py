@@ -165,7 +165,7 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
-    "poses": Stage(do_poses, "poses", version=8),
+    "poses": Stage(do_poses, "poses", version=9),
     "distill": Stage(do_distill, "distill", version=14),
     "mesh": Stage(do_mesh, "mesh", version=18),
     "fit": Stage(do_fit, "assets", version=4),

@@ -118,7 +118,10 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
         folder = out / f"try_{name.replace(' ', '_')}"
         try:
             judge = str(tries[0][1] / "database.db") if tries else ""
-            result = run_worker({**job, **settings, "judge": judge}, folder, timeout, on_progress)
+            # Of more photos only pairs that look alike are matched.
+            few = tries and len(photos) <= settings["exhaustive_up_to"]
+            pairs = {"pairs": worth_matching(tries[0], photos)} if few else {}
+            result = run_worker({**job, **settings, **pairs, "judge": judge}, folder, timeout, on_progress)
         except SdfsimError as error:
             if not tries:
                 raise
@@ -154,6 +157,17 @@ def seen_together(views: list[View]) -> list[list[str]]:
     ahead = np.array([view.rotation[2] for view in views])
     close = ahead @ ahead.T > np.cos(np.radians(WIDEST_PAIR))
     return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
+
+
+def worth_matching(first: tuple[dict, Path, dict], photos: list[Photo]) -> list[list[str]] | None:
+    """The pairs that a further attempt needs after one (checks, folder, result) whose poses can be trusted: those that
+    may show the same, and all of photos without a pose. None for all."""
+    if first[0]["failures"]:
+        return None
+    views = views_of(first[2], photos)
+    posed, names = {view.name for view in views}, [photo.name for photo in photos]
+    new = [[a, b] for k, a in enumerate(names) for b in names[k + 1 :] if not {a, b} <= posed]
+    return seen_together(views) + new
 
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
