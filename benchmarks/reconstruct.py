@@ -163,16 +163,9 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
     sampled = np.asarray(mesh.sample_points_uniformly(100_000).points)
     errors = distances(true_scene, sampled)
     near = (np.abs(sampled[:, 0]) < width / 2 + 0.1) & (np.abs(sampled[:, 1]) < 0.5) & (sampled[:, 2] > NEAR_FLOOR)
-    grid = np.stack(np.meshgrid(np.arange(4, about["w"], 8), np.arange(4, about["h"], 8)), -1).reshape(-1, 2) + 0.5
-    x, y = (grid[:, 0] - about["cx"]) / about["fl_x"], -(grid[:, 1] - about["cy"]) / about["fl_y"]
-    local, seen = np.stack([x, y, -np.ones(len(grid))], 1), []
-    for frame in about["frames"]:
-        pose = np.array(frame["transform_matrix"])
-        rays = np.concatenate([np.broadcast_to(pose[:3, 3], local.shape), local @ pose[:3, :3].T], 1)
-        hit = true_scene.cast_rays(rays.astype(np.float32))["t_hit"].numpy()
-        at = (rays[:, :3] + hit[:, None] * rays[:, 3:])[np.isfinite(hit)]
-        seen.append(at[at[:, 2] > NEAR_FLOOR])
-    missing = distances(_scene(mesh), np.concatenate(seen))
+    poses = [np.array(frame["transform_matrix"]) for frame in about["frames"]]
+    seen = np.concatenate([first_hits(true_scene, pose, pixels(about, 8)).reshape(-1, 3) for pose in poses])
+    missing = distances(_scene(mesh), seen[seen[:, 2] > NEAR_FLOOR])
     objects = {entry["name"]: read(f"objects/{entry['name']}.ply") for entry in read_parts(folder / "mesh")["objects"]}
     vases = {name: body for name, body in objects.items() if np.abs(body.get_center()[:2] - VASE).max() < 0.1}
     corners = np.asarray(truth.vertices)[np.asarray(truth.triangles)]
@@ -187,6 +180,53 @@ def surface_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, An
         "scale_error_percent": 100 * abs(scale - 1),
         "vase": {name: vase_size(body) for name, body in vases.items()} | {"truth": vase_size(truth)},
     }
+
+
+def pixels(about: dict[str, Any], every: int) -> np.ndarray:
+    """Directions [H, W, 3] through one in `every` pixels along each side of a photo, in OpenGL's camera axes."""
+    column, row = np.meshgrid(*(np.arange(every // 2, about[side], every) + 0.5 for side in "wh"))
+    x, y = (column - about["cx"]) / about["fl_x"], -(row - about["cy"]) / about["fl_y"]
+    return np.stack([x, y, -np.ones_like(x)], -1)
+
+
+def first_hits(surface: Any, pose: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """The places [H, W, 3] that a camera sees, NaN for none."""
+    rays = np.empty((*directions.shape[:2], 6), np.float32)
+    rays[..., :3], rays[..., 3:] = pose[:3, 3], directions @ pose[:3, :3].T
+    away = surface.cast_rays(rays)["t_hit"].numpy()
+    return np.where(np.isfinite(away)[..., None], rays[..., :3] + away[..., None] * rays[..., 3:], np.nan)
+
+
+def silhouettes(folder: Path, photos: Path, move: Similarity, held_out: list[str]) -> dict[str, float]:
+    """Intersection over union, %, of what the held-out photos show of a run's bodies and scenery, and of the truth:
+    the table with what stands on it, the vase, and the leaves of the plant, each told by where the first surface is."""
+    import make
+    import open3d as o3d
+
+    about = json.loads((photos / "transforms.json").read_text())
+    half = np.array(make.TABLE_SIZE) / 2 + 0.1
+
+    def near(places: np.ndarray, at: tuple[float, float], radius: float, above: float) -> np.ndarray:
+        return (np.linalg.norm(places[..., :2] - at, axis=-1) < radius) & (places[..., 2] > make.TABLE_HEIGHT + above)
+
+    regions = {
+        "table": lambda at: (np.abs(at[..., :2]) < half).all(-1) & (at[..., 2] > NEAR_FLOOR),
+        "vase": lambda at: near(at, make.VASE_AT, 0.16, 0.01),
+        "leaves": lambda at: near(at, make.PLANT_AT, 0.2, 0.115),
+    }
+    shown = o3d.geometry.TriangleMesh()
+    for file in (folder / "mesh" / "shown.ply", *sorted((folder / "mesh" / "objects").glob("*.ply"))):
+        shown += _read(file)
+    shown.vertices = o3d.utility.Vector3dVector(to_truth(folder, np.asarray(shown.vertices), move))
+    both = [_scene(_read(photos / "truth.ply")), _scene(shown)]
+    counts, directions = {name: np.zeros(2) for name in regions}, pixels(about, 1)
+    for frame in about["frames"]:
+        if Path(frame["file_path"]).name in held_out:
+            places = [first_hits(surface, np.array(frame["transform_matrix"]), directions) for surface in both]
+            for name, region in regions.items():
+                true, found = (region(at) for at in places)
+                counts[name] += np.array([(true & found).sum(), (true | found).sum()])
+    return {name: 100 * float(common / either) for name, (common, either) in counts.items()}
 
 
 def near_axis() -> np.ndarray:

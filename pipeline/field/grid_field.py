@@ -1,11 +1,14 @@
-"""The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through a Laplace density.
+"""The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through the surface's haze.
 
-Density and rendering follow VolSDF (Yariv et al., 2021, sections 3.1 and 3.2). Space is the unit sphere; a separate
-background outside of it uses contracted coordinates (Barron et al., 2022, eq. 10).
+The haze is VolSDF's Laplace distribution (Yariv et al., 2021, section 3.1), but what it hides of a ray is NeuS's (Wang
+et al., 2021, eq. 10 to 13): half of it where the surface is, also for a ray that only grazes it. VolSDF's density hides
+half of a grazing ray at three times the haze's scale already, and training moved edges inwards by as much. Space is the
+unit sphere; a separate background outside of it uses contracted coordinates (Barron et al., 2022, eq. 10).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -56,19 +59,29 @@ BACKGROUND_SAMPLES = 12
 GEOMETRY = 13  # features from the SDF network to the colour network
 
 
-def laplace_density(sdf: Tensor, beta: float) -> Tensor:
-    """Density 1/beta * Psi_beta(-sdf) with Psi the Laplace distribution function (VolSDF eq. 2, 3; alpha = 1/beta)."""
+def optical_depths(sdf: Tensor, beta: float) -> Tensor:
+    """Optical depth [R, S] from each sample's predecessor along a ray, from the camera for the first, to the sample, of
+    signed distances [R, S] near to far: what they take from the logarithm of the Laplace distribution function of scale
+    beta (VolSDF eq. 2; NeuS eq. 13)."""
     decay = 0.5 * torch.exp(-sdf.abs() / beta)
-    return torch.where(sdf > 0, decay, 1 - decay) / beta
+    passed = torch.where(sdf > 0, torch.log1p(-decay), math.log(0.5) - sdf.abs() / beta)
+    return functional.relu(functional.pad(passed[:, :-1], (1, 0)) - passed)
 
 
-def render_weights(density: Tensor, delta: Tensor) -> tuple[Tensor, Tensor]:
-    """Quadrature of the volume rendering integral, from densities [R, S] near to far and lengths [R, S] of their
-    intervals: the weight [R, S] of each sample, and the transmittance [R] behind the last one."""
-    depth = torch.cumsum(density * delta, 1)
-    before = torch.cat([torch.zeros_like(depth[:, :1]), depth[:, :-1]], 1)
-    weights = torch.exp(-before) * -torch.expm1(-(density * delta))
-    return weights, torch.exp(-depth[:, -1])
+def render_weights(depths: Tensor) -> tuple[Tensor, Tensor]:
+    """Quadrature of the volume rendering integral, from optical depths [R, S] of intervals, near to far: the weight
+    [R, S] of each interval, and the transmittance [R] behind the last one."""
+    depth = torch.cumsum(depths, 1)
+    before = functional.pad(depth[:, :-1], (1, 0))
+    return torch.exp(-before) * -torch.expm1(-depths), torch.exp(-depth[:, -1])
+
+
+def sample_weights(sdf: Tensor, beta: float) -> tuple[Tensor, Tensor]:
+    """The weight [R, S] of each sample of a ray from signed distances [R, S], and the transmittance [R] behind the last
+    one. An interval between two samples counts half for each."""
+    weights, left = render_weights(optical_depths(sdf, beta))
+    half = weights[:, 1:] / 2
+    return torch.cat([weights[:, :1], half], 1) + functional.pad(half, (0, 1)), left
 
 
 def direction_features(directions: Tensor) -> Tensor:
@@ -107,7 +120,7 @@ class Background(nn.Module):
         # Optical depth per step of inverse radius, so that far steps do not weigh more than near ones.
         depth = functional.softplus(values[..., 0] * 10 - 1.0)
         depth = torch.cat([depth[:, :-1], torch.full_like(depth[:, -1:], 20.0)], 1)
-        weights, _ = render_weights(depth, torch.ones_like(depth))
+        weights, _ = render_weights(depth)
         return (weights[..., None] * torch.sigmoid(values[..., 1:] * 10)).sum(1)
 
 

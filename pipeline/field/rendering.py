@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.field.grid_field import BACKGROUND_SAMPLES, GridField, laplace_density, render_weights
+from pipeline.field.grid_field import BACKGROUND_SAMPLES, GridField, sample_weights
 from pipeline.grids.interpolation import interpolate
 
 COARSE = 4  # cells of the cached SDF between points where the field is always evaluated
@@ -64,7 +64,6 @@ class Samples:
     """Sample points of the field along some rays."""
 
     distance: Tensor  # [R, S] from the camera, in order, normalised units
-    delta: Tensor  # [R, S] length of each sample's interval
     points: Tensor  # [R, S, 3]
     directions: Tensor  # [R, 3] unit
     near_surface: Tensor  # [R, S] whether it was drawn by importance
@@ -84,16 +83,15 @@ def choose_samples(
     sdf = interpolate(cache, points.view(-1, 3)).view(len(origins), bins)
     # The cache has the surface only to a fraction of its cell, so the width is not smaller.
     broad = max(beta, 0.6 / cache.shape[0])
-    weights, _ = render_weights(laplace_density(sdf, broad), (length / bins).expand(-1, bins))
+    weights, _ = sample_weights(sdf, broad)
     count = uniforms.shape[1] - plain
     edges = torch.linspace(0, 1, bins + 1, device=cache.device).expand(len(origins), -1)
     importance = draw(edges, weights + 9e-5, uniforms[:, :count])
     even = (torch.arange(plain, device=cache.device) + uniforms[:, count:]) / plain
     position, order = torch.cat([importance, even], 1).sort(1)
     distance = enter[:, None] + length * position
-    edge = torch.cat([enter[:, None], (distance[:, 1:] + distance[:, :-1]) / 2, leave[:, None]], 1)
     points = origins[:, None] + distance[..., None] * directions[:, None]
-    return Samples(distance, edge[:, 1:] - edge[:, :-1], points, directions, order < count)
+    return Samples(distance, points, directions, order < count)
 
 
 def composite(
@@ -103,7 +101,7 @@ def composite(
     [3]: `rgb` [R, 3] and `opacity` [R] inside the sphere."""
     sdf, features, grid = geometry
     shape = samples.distance.shape
-    weights, left = render_weights(laplace_density(sdf, beta).view(shape), samples.delta)
+    weights, left = sample_weights(sdf.view(shape), beta)
     # Colour costs as much as the SDF, and most samples have no weight.
     chosen = torch.nonzero(weights.detach().view(-1) > 5e-4)[:, 0]
     seen_along = samples.directions[:, None].expand(*shape, 3).reshape(-1, 3)[chosen]

@@ -79,7 +79,7 @@ class Settings:
     curvature: float = 0.01  # weight of |Laplacian| at the start, in units of the finest active cell
     sparse: float = 0.3  # weight of |sdf| at the points of structure-from-motion
     depth: float = 0.3  # weight of |sdf| at the points of a depth sensor, at the start
-    free: float = 1.0  # weight of solid matter between a camera and a point that it sees
+    free: float = 0.3  # weight of solid matter between a camera and a point that it sees
     mask: float = 0.3  # weight of the opacity loss if photos have masks
     exposure: float = 0.02  # weight of the penalty on differences of exposure
     surface_points: int = 512  # points of the eikonal loss

@@ -1,4 +1,4 @@
-"""Photos -> camera poses and sparse points, in at most three attempts; each result is checked."""
+"""Photos -> camera poses and sparse points, in at most four attempts; each result is checked."""
 
 import os
 import re
@@ -33,14 +33,18 @@ ORDINARY: dict[str, Any] = {
     "pose_inliers": 30, "exhaustive_up_to": 30,
     "all_up_to": 150,  # photos; beyond this, pairs that do not look alike are never matched
 }  # fmt: skip
+CAREFUL: dict[str, Any] = {
+    "max_ratio": 0.88, "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0,
+    "pose_inliers": 15,
+}  # fmt: skip
 # The worker's settings for each attempt, by name. The attempts end with the first that gives trusted poses of all
 # photos.
 ATTEMPTS = {
     "ordinary": ORDINARY,
     "without static matches": {**ORDINARY, "moving_only": True},
+    "more matches": {**ORDINARY, **CAREFUL, "all_up_to": 0},
     "more features": {
-        **ORDINARY, "pixels": 1600, "max_features": 12000, "largest": 12000, "peak_threshold": 0.003, "max_ratio": 0.88,
-        "min_inliers": 12, "min_inlier_ratio": 0.25, "init_inliers": 40, "init_angle": 6.0, "pose_inliers": 15,
+        **ORDINARY, **CAREFUL, "pixels": 1600, "max_features": 12000, "largest": 12000, "peak_threshold": 0.003,
         "exhaustive_up_to": 40, "all_up_to": 40,  # A pair takes most of a second.
     },
 }  # fmt: skip
@@ -100,28 +104,29 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 6,  # of the child's files, which a resumed run reads
+        "version": 7,  # of the child's files, which a resumed run reads
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,
-        "pairs": seen_together(load_views(known)) if known.exists() else None,
+        "pairs": seen_together(load_views(known)) if known.exists() else None, "features_of": "",
         "partners": int(np.clip(SHARE * len(photos), *PARTNERS)),
     }  # fmt: skip
     tries: list[tuple[dict, Path, dict]] = []
     attempts: list[dict] = []
+    best: Any = None
     for name, settings in ATTEMPTS.items():
         if tries and (job["known_cameras"] or not hopeful(settings, tries[0][0])):
             continue
-        if any(not checks["failures"] and not worth_more(checks) for checks, _, _ in tries):
+        if tries and not best[0]["failures"] and not worth_more(best[0]):
             break
-
         folder = out / f"try_{name.replace(' ', '_')}"
         try:
-            judge = str(tries[0][1] / "database.db") if tries else ""
-            # Of more photos only pairs that look alike are matched.
-            few = tries and len(photos) <= settings["exhaustive_up_to"]
-            pairs = {"pairs": worth_matching(tries[0], photos)} if few else {}
-            result = run_worker({**job, **settings, **pairs, "judge": judge}, folder, timeout, on_progress)
+            judge, more = str(tries[0][1] / "database.db") if tries else "", {}
+            if name == "more matches":
+                more = {"features_of": judge, "pairs": with_new(tries[0], photos)}
+            elif tries and len(photos) <= settings["exhaustive_up_to"]:  # else only pairs that look alike
+                more = {"pairs": worth_matching(tries[0], photos)}
+            result = run_worker({**job, **settings, **more, "judge": judge}, folder, timeout, on_progress)
         except SdfsimError as error:
             if not tries:
                 raise
@@ -130,10 +135,8 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
             continue
         checks = check(result, photos, tries[0][2] if tries else None, known=bool(job["known_cameras"]))
         tries.append((checks, folder, result))
+        best = tries[-1] if best is None or better(tries[-1], best) else best
         attempts.append({"name": name, "posed": checks["posed"], "failures": checks["failures"]})
-    best = tries[0]
-    for one in tries[1:]:
-        best = one if better(one, best) else best
     checks, folder, result = best
     checks["attempts"], checks["known_cameras"] = attempts, bool(job["known_cameras"])
     views = views_of(result, photos) if job["refine"] or not job["known_cameras"] else load_views(known)
@@ -159,15 +162,20 @@ def seen_together(views: list[View]) -> list[list[str]]:
     return [[views[a].name, views[b].name] for a, b in np.argwhere(np.triu(close, 1)).tolist()]
 
 
-def worth_matching(first: tuple[dict, Path, dict], photos: list[Photo]) -> list[list[str]] | None:
-    """The pairs that a further attempt needs after one (checks, folder, result) whose poses can be trusted: those that
-    may show the same, and all of photos without a pose. None for all."""
+def with_new(first: tuple[dict, Path, dict], photos: list[Photo]) -> list[list[str]] | None:
+    """The pairs of photos of which an attempt (checks, folder, result) has posed at most one. None for all pairs, if
+    its poses cannot be trusted."""
     if first[0]["failures"]:
         return None
-    views = views_of(first[2], photos)
-    posed, names = {view.name for view in views}, [photo.name for photo in photos]
-    new = [[a, b] for k, a in enumerate(names) for b in names[k + 1 :] if not {a, b} <= posed]
-    return seen_together(views) + new
+    posed, names = {view["name"] for view in first[2]["views"]}, [photo.name for photo in photos]
+    return [[a, b] for k, a in enumerate(names) for b in names[k + 1 :] if not {a, b} <= posed]
+
+
+def worth_matching(first: tuple[dict, Path, dict], photos: list[Photo]) -> list[list[str]] | None:
+    """The pairs that an attempt with other features needs after one (checks, folder, result): those that may show the
+    same, and all with a photo that has no pose. None for all pairs, if its poses cannot be trusted."""
+    new = with_new(first, photos)
+    return new if new is None else seen_together(views_of(first[2], photos)) + new
 
 
 def run_worker(job: dict, folder: Path, timeout: float, on_progress: Progress) -> dict:
@@ -225,7 +233,8 @@ def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
         pairs = count * (count - 1) // 2
         if count > job["exhaustive_up_to"]:
             pairs = min(pairs, count * job["partners"] * 3 // 5)  # About four in ten name each other.
-        table, total = "two_view_geometries", pairs if job["pairs"] is None else len(job["pairs"])
+        known = job["pairs"] is None or job["features_of"]  # Pairs that are not matched again count too.
+        table, total = "two_view_geometries", pairs if known else len(job["pairs"])
     rows = 0
     address = f"file:{folder / 'database.db'}?mode=ro"  # It may not exist yet, or be busy.
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True, timeout=0.2)) as found:

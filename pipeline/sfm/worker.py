@@ -46,6 +46,7 @@ STILL = 2.0  # px between the pixels of a match in two photos: below this it did
 # What does not move in this share of the pairs, in a cell of so many along a picture's width, is a logo or a date, if
 # such cells are a small share of the picture; more is a background. On a street no cell had 0.06.
 CELLS, OFTEN, SMALL = 48, 0.15, 0.2
+LARGEST_ID = 2**31 - 1  # of COLMAP's images; the number of a pair is the smaller one's times this plus the other's
 TURNS = 200  # largest number of pairs of photos that are checked for turns on the spot
 
 
@@ -83,6 +84,22 @@ def features(pycolmap, job: dict, database: Path) -> None:
         )  # fmt: skip
     if job["largest"]:
         keep_largest(database, job["largest"])
+
+
+def take_features(job: dict, database: Path) -> None:
+    """Copies the database of an earlier attempt, without the matches of those pairs that are matched again."""
+    partial = database.with_suffix(".part")
+    shutil.copyfile(job["features_of"], partial)
+    with closing(sqlite3.connect(partial)) as opened:
+        number = dict(opened.execute("SELECT name, image_id FROM images"))
+        again = "1"  # all
+        if job["pairs"] is not None:
+            ends = [sorted((number[a], number[b])) for a, b in job["pairs"]]
+            again = f"pair_id IN ({','.join(str(a * LARGEST_ID + b) for a, b in ends)})"
+        for table in ("matches", "two_view_geometries"):
+            opened.execute(f"DELETE FROM {table} WHERE {again}")
+        opened.commit()
+    partial.replace(database)
 
 
 def keep_largest(database: Path, count: int) -> None:
@@ -513,6 +530,8 @@ def main(job_path: str) -> None:
     database = out / "database.db"
     pycolmap.set_random_seed(job["seed"])
     print("phase features", flush=True)
+    if job["features_of"] and not database.exists():
+        take_features(job, database)
     features(pycolmap, job, database)
     print("phase matches", flush=True)
     matches(pycolmap, job, database)

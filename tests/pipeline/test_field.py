@@ -18,8 +18,7 @@ from pipeline.field.grid_field import (
     GridField,
     contract,
     differences,
-    laplace_density,
-    render_weights,
+    sample_weights,
     stencil,
 )
 from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
@@ -39,22 +38,36 @@ from tests.helpers.fields import SMALL, assert_resumes, posed_noise, toy_rays
 from tests.helpers.sparse import NOTHING
 
 
-def test_laplace_density_is_the_distribution_function():
-    beta, s = 0.1, torch.linspace(-1, 1, 201, dtype=torch.float64)
-    density, x = laplace_density(s, beta), s.numpy()
-    expected = np.where(x > 0, 0.5 * np.exp(-x / beta), 1 - 0.5 * np.exp(x / beta)) / beta
-    np.testing.assert_allclose(density.numpy(), expected, rtol=1e-12)
-    assert laplace_density(torch.zeros(1), beta).item() == pytest.approx(0.5 / beta)
+def laplace(distance: float, beta: float) -> float:
+    """The share of the light that the haze of a surface lets through, from the Laplace distribution function."""
+    return 1 - 0.5 * np.exp(-distance / beta) if distance > 0 else 0.5 * np.exp(distance / beta)
 
 
-def test_transmittance_in_front_of_a_plane_matches_the_integral():
-    # Ray towards the plane s = 1 - t; integral of the density up to t < 1 is 0.5 exp((t - 1) / beta) (from -inf).
-    beta, t = 0.05, torch.linspace(0, 1, 4001, dtype=torch.float64)
-    middle, delta = (t[1:] + t[:-1]) / 2, (t[1:] - t[:-1])
-    weights, left = render_weights(laplace_density(1 - middle, beta)[None], delta[None])
-    optical = 0.5 * (np.exp(0.0) - np.exp(-1 / beta))
-    assert left.item() == pytest.approx(np.exp(-optical), rel=1e-6)
+@pytest.mark.parametrize("beta", [0.1, 0.004])
+@pytest.mark.parametrize("nearest", [0.02, 0.004, 0.0, -0.004, -0.02])
+def test_half_of_a_ray_is_hidden_where_it_touches_a_surface(nearest: float, beta: float):
+    # Past a ball, up to `nearest` outside of its surface: it is hidden as by a wall as far away, however long it stays.
+    t, radius = torch.linspace(-1, 1, 4001, dtype=torch.float64), 0.3
+    sdf = torch.sqrt(t**2 + (radius + nearest) ** 2) - radius
+    weights, left = sample_weights(sdf[None], beta)
+    first = laplace(sdf[0].item(), beta)
+    assert first > 0.99
+    assert left.item() == pytest.approx(laplace(nearest, beta), rel=1e-9)
     assert weights.sum().item() + left.item() == pytest.approx(1.0, rel=1e-12)
+
+
+def test_a_wall_shows_where_it_is():
+    # At any slope half of the light ends before the surface and half behind it.
+    for slope in (1.0, 0.2):
+        t = torch.linspace(0, 1, 4001, dtype=torch.float64)
+        weights, left = sample_weights((slope * (0.7 - t))[None], 0.004)
+        assert weights[0, t < 0.7].sum().item() == pytest.approx(0.5, abs=0.02)
+        assert left.item() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_ray_that_starts_inside_sees_its_first_sample():
+    weights, left = sample_weights(torch.tensor([[-0.5, -0.4, 0.3, 0.4]], dtype=torch.float64), 0.01)
+    assert weights[0, 0].item() == pytest.approx(1.0, abs=1e-6) and left.item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_sphere_interval_closed_form():
@@ -92,7 +105,6 @@ def test_samples_gather_at_the_surface():
     origin, direction = torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]])
     found = choose_samples(cache, origin, direction, 0.01, torch.full((1, 32), 0.5))
     assert (found.distance.diff() >= 0).all()
-    assert found.delta.sum().item() == pytest.approx(2.0, rel=1e-5)
     assert (found.points[found.near_surface].norm(dim=1) - 0.5).abs().median() < 0.05
 
 

@@ -261,7 +261,7 @@ def climb(monkeypatch, tmp_path, results: dict, photos: int = 10) -> tuple[list[
     return tried, checks
 
 
-STILL, MORE = "without static matches", "more features"
+STILL, MATCHES, MORE = "without static matches", "more matches", "more features"
 STOPPED = SdfsimError("camera poses: stopped after 5 s")
 
 
@@ -271,7 +271,8 @@ STOPPED = SdfsimError("camera poses: stopped after 5 s")
         ({MORE: result(10, 10)}, MORE, 10),  # the first good attempt is the last
         ({"ordinary": result(10, 0, still=0.9), STILL: result(10, 10)}, STILL, 10),
         # Photos that good poses leave out. More features are found less exactly, which says nothing of the poses.
-        ({"ordinary": result(25, 19), MORE: result(25, 25, error=0.75)}, MORE, 25),
+        ({"ordinary": result(25, 19), MATCHES: result(25, 25)}, MATCHES, 25),
+        ({"ordinary": result(25, 19), MATCHES: result(25, 20), MORE: result(25, 25, error=0.75)}, MORE, 25),
         # The best attempt counts, not the last, and one that breaks leaves the findings of the others.
         ({"ordinary": result(10, 4), MORE: result(10, 3)}, MORE, "only 4 of 10 photos"),
         ({"ordinary": result(10, 4), MORE: STOPPED}, MORE, "IMG_4.JPG"),
@@ -281,7 +282,7 @@ STOPPED = SdfsimError("camera poses: stopped after 5 s")
 def test_attempts_go_on_until_poses_are_good(monkeypatch, tmp_path, results, after, posed):
     count = len(results.get("ordinary", result(10, 0))["counts"])
     tried, checks = climb(monkeypatch, tmp_path, results, count)
-    assert tried == ["ordinary", after][: 1 + bool(after)]
+    assert tried == {"": ["ordinary"], MORE: ["ordinary", MATCHES, MORE]}.get(after, ["ordinary", after])
     if isinstance(posed, str):
         assert posed in checks["error"]
         return
@@ -300,8 +301,8 @@ def worse(found: dict) -> dict:
 )
 def test_good_poses_stay_where_the_careful_attempt_is_no_better(monkeypatch, tmp_path, careful):
     """Fewer photos, or more of them but those of before farther off, or wrong ones, or none in time."""
-    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(25, 19), MORE: careful}, 25)
-    assert tried == ["ordinary", MORE] and checks["posed"] == 19 and checks["failures"] == []
+    tried, checks = climb(monkeypatch, tmp_path, {"ordinary": result(25, 19), MATCHES: careful, MORE: careful}, 25)
+    assert tried == ["ordinary", MATCHES, MORE] and checks["posed"] == 19 and checks["failures"] == []
 
 
 def test_photos_that_no_care_would_pose_get_no_careful_attempt(monkeypatch, tmp_path):
@@ -316,7 +317,7 @@ def test_photos_that_no_care_would_pose_get_no_careful_attempt(monkeypatch, tmp_
 
 
 def test_a_finished_attempt_is_not_run_again(tmp_path, monkeypatch):
-    job = {"count": 3, "exhaustive_up_to": 100, "pairs": None}
+    job = {"count": 3, "exhaustive_up_to": 100, "pairs": None, "features_of": ""}
     (tmp_path / "try").mkdir()
     write_json(tmp_path / "try" / "job.json", job)
     write_json(tmp_path / "try" / "result.json", {"views": []})
@@ -328,8 +329,9 @@ def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     write_json(tmp_path / "job.json", {"count": 4})
     (tmp_path / "database.db").write_text("old")
     monkeypatch.setattr(sys, "executable", "/bin/false")
+    job = {"count": 3, "exhaustive_up_to": 100, "pairs": None, "features_of": ""}
     with pytest.raises(SdfsimError):
-        run_worker({"count": 3, "exhaustive_up_to": 100, "pairs": None}, tmp_path, 5.0, lambda fraction, message: None)
+        run_worker(job, tmp_path, 5.0, lambda fraction, message: None)
     assert not (tmp_path / "database.db").exists()
 
 
