@@ -36,7 +36,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "pho
 
 from benchmarks.records import ROOT, Cell, Out, write_record
 from pipeline.cameras import Similarity, View, load_views
-from pipeline.field.training import load_field
+from pipeline.field.training import HELD_OUT, SCORED, load_field
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
@@ -197,11 +197,17 @@ def first_hits(surface: Any, pose: np.ndarray, directions: np.ndarray) -> np.nda
     return np.where(np.isfinite(away)[..., None], rays[..., :3] + away[..., None] * rays[..., 3:], np.nan)
 
 
-def silhouettes(folder: Path, photos: Path, move: Similarity, held_out: list[str]) -> dict[str, float]:
-    """Intersection over union, %, of what the held-out photos show of a run's bodies and scenery, and of the truth:
-    the table with what stands on it, the vase, and the leaves of the plant, each told by where the first surface is."""
+def held_out_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, float]:
+    """What held-out photos show.
+
+    `table`, `vase`, `leaves`: intersection over union, %, of what a run's bodies and scenery cover of them and of what
+    the truth covers: the table with what stands on it, the vase, and the leaves of the plant, each told by where the
+    first surface is. `psnr`: of the pixels of the table and what stands on it, dB, as the field renders them.
+    `sharpness`: the sum of differences between neighbouring pixels there, as a share of the photos', %.
+    """
     import make
     import open3d as o3d
+    from PIL import Image
 
     about = json.loads((photos / "transforms.json").read_text())
     half = np.array(make.TABLE_SIZE) / 2 + 0.1
@@ -220,13 +226,31 @@ def silhouettes(folder: Path, photos: Path, move: Similarity, held_out: list[str
     shown.vertices = o3d.utility.Vector3dVector(to_truth(folder, np.asarray(shown.vertices), move))
     both = [_scene(_read(photos / "truth.ply")), _scene(shown)]
     counts, directions = {name: np.zeros(2) for name in regions}, pixels(about, 1)
-    for frame in about["frames"]:
-        if Path(frame["file_path"]).name in held_out:
-            places = [first_hits(surface, np.array(frame["transform_matrix"]), directions) for surface in both]
-            for name, region in regions.items():
-                true, found = (region(at) for at in places)
-                counts[name] += np.array([(true & found).sum(), (true | found).sum()])
-    return {name: 100 * float(common / either) for name, (common, either) in counts.items()}
+    error, steps = np.zeros(2), np.zeros(2)  # squares and their number; differences in the render and in the photo
+    for name in load_field(folder / "distill").report["held_out_photos"]:
+        frame = next(one for one in about["frames"] if Path(one["file_path"]).name == name)
+        rendered = folder / "distill" / HELD_OUT / f"{int(Path(name).stem):04d}.jpg"
+        places = [first_hits(surface, np.array(frame["transform_matrix"]), directions) for surface in both]
+        for part, region in regions.items():
+            true, found = (region(at) for at in places)
+            counts[part] += np.array([(true & found).sum(), (true | found).sum()])
+        drawn = np.asarray(Image.open(rendered), float)
+        size = [SCORED * side for side in drawn.shape[1::-1]]  # One in so many pixels along each side is rendered.
+        given, inside = (
+            np.asarray(image.resize(size, way), float)[SCORED // 2 :: SCORED, SCORED // 2 :: SCORED]
+            for image, way in (
+                (Image.open(photos / frame["file_path"]), Image.Resampling.BOX),
+                (Image.fromarray(regions["table"](places[0])), Image.Resampling.NEAREST),
+            )
+        )
+        error += np.array([(inside[..., None] * (drawn - given) ** 2).sum(), 3 * inside.sum()])
+        for number, grey in enumerate((drawn.mean(-1), given.mean(-1))):
+            change = np.hypot(np.diff(grey, axis=0)[:, 1:], np.diff(grey, axis=1)[1:])
+            steps[number] += (inside[1:, 1:] * change).sum()
+    return {name: 100 * float(common / either) for name, (common, either) in counts.items()} | {
+        "psnr": float(20 * np.log10(255) - 10 * np.log10(error[0] / error[1])),
+        "sharpness": 100 * float(steps[0] / steps[1]),
+    }
 
 
 def near_axis() -> np.ndarray:
@@ -304,6 +328,7 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
     surface = surface_errors(folder, photos, move)
     return {
         "poses": poses, "surface_percent_of_table_width": surface, "trust": trust_errors(folder, photos, move),
+        "held_out": held_out_errors(folder, photos, move) if photos == PHOTOS else {},
         "ball": {name: dropped_ball(folder, name, surface["scale"]) for name in surface["vase"] if name != "truth"},
     }  # fmt: skip
 
@@ -440,7 +465,14 @@ def figures(found: dict[str, Any], report: dict[str, Any]) -> list[tuple[Cell, .
     rows += [("error of the scale, %", surface["scale_error_percent"]), ("steps", steps.get("iterations"))]
     rows += [("training of the field with stereo, min", report["seconds"]["distill"] / 60)]
     rows.append(("in all, min", sum(report["seconds"].values()) / 60))
-    return [*rows, ("PSNR of held-out photos, dB", report["psnr"])]
+    rows.append(("PSNR of held-out photos, dB", report["psnr"]))
+    names = {
+        "psnr": "the same of the table and what stands on it, dB",
+        "sharpness": "differences of neighbouring pixels there, % of the photos'",
+        "table": "what the surface covers of these photos, intersection over union, %: table and all on it",
+        "vase": "the same of the vase, %", "leaves": "the same of the leaves of the plant, %",
+    }  # fmt: skip
+    return [*rows, *((words, found["held_out"][key]) for key, words in names.items() if key in found["held_out"])]
 
 
 TRUST = ("part", "uncertainty, mm", "error, median, mm", "error, 90 % below, mm")

@@ -39,11 +39,13 @@ ALIKE, SURE = 0.35, 0.9  # correlations between which the trust in a place rises
 SPREAD, FAR = 3.0, 2.0
 # A place has full weight if the mean trust within NEAR edges is EVEN: a single match at an edge is a mistake.
 NEAR, EVEN = 8, 0.3
-# Weights relative to trust: of the surface's area, of its bending, of a vertex's old position, and of that where no
+# Weights relative to trust: of the surface's bending, of a vertex's old position, and of that where no
 # photo shows the surface.
-AREA, BENDING, STAY, PINNED = 0.2, 0.3, 0.002, 0.5
+BENDING, STAY, PINNED = 0.3, 0.002, 0.5
 AROUND, KNOWN = 20, 0.1 / EVERY  # edges, and mean trust within them, below which vertices stay
-SMOOTHED = 4  # times after each round
+SMOOTHED, SMOOTHING = 4, (0.5, -0.53)  # times after each round, and how far towards the mean of the neighbours
+# Lengths of the mean normal within `NEAR` edges, from a rim to a surface that is flat there.
+RIM, FLAT = 0.6, 0.9
 STEPS = 300  # of conjugate gradients; after these the equations count as not solved (not tuned)
 WALL = 0.25  # of the distance to the opposite surface, inside or outside, that a vertex may move in a round
 
@@ -105,10 +107,14 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
     low = height(mesh.vertices) < layer
     upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
     for number in range(ROUNDS):
-        normal = vertex_normals(mesh)
+        normal = usual = vertex_normals(mesh)
         for _ in range(4):
             normal = normal + mean @ normal
             normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        for _ in range(NEAR):
+            usual = mean @ usual
+        # Around a rim normals differ. A patch there shows what lies behind, and no photo agrees on a place.
+        flat = ((np.linalg.norm(usual, axis=1) - RIM) / (FLAT - RIM)).clip(0, 1)
         picked = np.random.default_rng(number).permutation(count)[: count // EVERY]
         moves = np.linspace(-1, 1, PLACES) * REACH * finest / (1 if number + 1 < ROUNDS else 2)
         score = patch_correlation(Visibility(mesh, lift, blocking).at(picked), normal[picked], pictures, moves)
@@ -122,12 +128,12 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         near = weight
         for _ in range(NEAR):
             near = mean @ near
-        weight = weight * (near / (EVEN / EVERY)).clip(0, 1)
+        weight = weight * (near / (EVEN / EVERY)).clip(0, 1) * flat
         known = np.stack([weight, ~low], 1)
         for _ in range(AROUND):
             known = mean @ known
         known = (known[:, 0] / (KNOWN * known[:, 1]).clip(1e-6)).clip(0, 1)
-        stay = STAY + PINNED * (1 - known)
+        stay = STAY + PINNED * (1 - known * flat)
         moved, converged = settled(mesh, along, mean, wanted, weight, stay)
         # A place that contradicts the surface around it was a mistake.
         off = np.abs(moved - wanted)
@@ -146,8 +152,9 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         inwards, outwards = (caster.hits(mesh.vertices + way * skin, way * normal)[0] for way in (-1, 1))
         moved = moved.clip(-WALL * inwards, WALL * outwards)
         vertices = mesh.vertices + moved[:, None] * along
-        for _ in range(SMOOTHED):
-            vertices = vertices + 0.5 * (known * ~low)[:, None] * (mean @ vertices - vertices)
+        # There and back, because steps in one direction alone shrink rims and the tips of leaves (Taubin, 1995).
+        for share in SMOOTHING * SMOOTHED:
+            vertices = vertices + share * (known * ~low)[:, None] * (mean @ vertices - vertices)
         mesh = replace(mesh, vertices=vertices)
     return mesh, ""
 
@@ -208,7 +215,7 @@ def settled(mesh: Mesh, normal: np.ndarray, mean: csr_matrix, wanted: np.ndarray
     """
     bend = mean - diags(np.ones(len(trust)))
     inwards = ((bend @ mesh.vertices) * normal).sum(1)
-    matrix = diags(trust + stay) + BENDING * (bend.T @ bend) - AREA * (bend + bend.T) / 2
-    right = trust * wanted - BENDING * (bend.T @ inwards) + AREA * inwards
+    matrix = diags(trust + stay) + BENDING * (bend.T @ bend)
+    right = trust * wanted - BENDING * (bend.T @ inwards)
     moved, failed = cg(matrix.tocsr(), right, rtol=1e-3, maxiter=STEPS)
     return moved, failed == 0 and bool(np.isfinite(moved).all())

@@ -233,8 +233,9 @@ def estimate(folder: Path, lines: Path, job: dict) -> tuple[float, str]:
         pairs = count * (count - 1) // 2
         if count > job["exhaustive_up_to"]:
             pairs = min(pairs, count * job["partners"] * 3 // 5)  # About four in ten name each other.
-        known = job["pairs"] is None or job["features_of"]  # Pairs that are not matched again count too.
-        table, total = "two_view_geometries", pairs if known else len(job["pairs"])
+        if job["pairs"] is not None and not job["features_of"]:  # There pairs that are not matched again count too.
+            pairs = len(job["pairs"])
+        table, total = "two_view_geometries", pairs
     rows = 0
     address = f"file:{folder / 'database.db'}?mode=ro"  # It may not exist yet, or be busy.
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True, timeout=0.2)) as found:

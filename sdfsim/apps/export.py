@@ -30,7 +30,7 @@ from sdfsim.base.files import cached_arrays, check_writable, digest, user_cache,
 from sdfsim.base.lazy import optional
 from sdfsim.base.parallel import StageProgress, of_stage, silent_stages
 from sdfsim.geometry.gltf import GltfWriter, light
-from sdfsim.geometry.mesh import Mesh, convex_hull, far_middle
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, is_closed, lattice
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, wavefront
 from sdfsim.physics import pose
 from sdfsim.scene.builder import SceneBuilder
@@ -46,6 +46,7 @@ _log = logging.getLogger(__name__)
 
 # Concavity relative to the size; and a search a third as long as CoACD's default, which finds equally good pieces.
 COACD = {"threshold": 0.05, "mcts_iterations": 60, "mcts_nodes": 10, "resolution": 1000, "seed": 0}
+SOLID_CELLS = 64  # along the longest side of a surface made from a distance, for these pieces
 PIECES_VERSION = 1  # of cached pieces; a new one if they are made otherwise
 RATE = 60.0  # USD time codes per second if no frame rate is given; programs step through whole ones
 # Schemas of PhysX (Isaac Sim, ManiSkill) and Newton for sampled distances, and the attribute for the number of cells
@@ -318,30 +319,43 @@ def convex_pieces(shape: Shape, *, warn: bool = False) -> list[Mesh]:
     cache. With `warn`, a warning says so when that takes long. Raises SdfsimError if there are none."""
     if own := own_pieces(shape):
         return own
-    known = digest(shape.mesh.vertices, shape.mesh.faces, COACD)
+    mesh = shape.mesh if is_closed(shape.mesh) else _solid(shape)
+    known = digest(mesh.vertices, mesh.faces, COACD)
     kept = cached_arrays(
-        user_cache("pieces") / f"{known}-{PIECES_VERSION}.npz", "convex pieces", lambda: _cut(shape, warn=warn)
+        user_cache("pieces") / f"{known}-{PIECES_VERSION}.npz", "convex pieces", lambda: _cut(shape.name, mesh, warn)
     )
     ends = np.cumsum(kept["count"])[:-1]
     return [convex_hull(vertices) for vertices in np.split(kept["vertices"], ends)]
 
 
-def _cut(shape: Shape, *, warn: bool) -> dict[str, Any]:
-    """The vertices [V, 3] m of CoACD's pieces, one after the other, and how many each has."""
+def _cut(name: str, mesh: Mesh, warn: bool) -> dict[str, Any]:
+    """The vertices [V, 3] m of CoACD's pieces of a mesh, one after the other, and how many each has."""
     if warn:
-        _log.warning(
-            "cutting the shape %s into convex pieces: some seconds, or minutes; once for this mesh", shape.name
-        )
+        _log.warning("cutting the shape %s into convex pieces: some seconds, or minutes; once for this mesh", name)
     import open3d  # noqa: F401  (it fails to load after CoACD)
 
     coacd = optional("coacd", "coacd", "export")
     coacd.set_log_level("off")
     try:
-        found = coacd.run_coacd(coacd.Mesh(shape.mesh.vertices, shape.mesh.faces), **COACD)
+        found = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **COACD)
         hulls = [convex_hull(np.asarray(vertices)).vertices for vertices, _ in found]
     except (RuntimeError, ValueError, SdfsimError) as error:
-        raise SdfsimError(f"shape {shape.name}: CoACD cannot cut it into convex pieces ({error})") from error
+        raise SdfsimError(f"shape {name}: CoACD cannot cut it into convex pieces ({error})") from error
     return {"vertices": np.concatenate(hulls), "count": [len(hull) for hull in hulls]}
+
+
+def _solid(shape: Shape) -> Mesh:
+    """The closed surface of a shape's distance, where its drawn mesh is open: scenery from photos."""
+    from skimage.measure import marching_cubes
+
+    low, high = shape.mesh.vertices.min(0), shape.mesh.vertices.max(0)
+    cell = float((high - low).max()) / SOLID_CELLS
+    counts = np.ceil((high - low) / cell).astype(int) + 5
+    start = low - 2 * cell
+    values = shape.sdf(start + cell * lattice(*(np.arange(count) for count in counts)))[0].reshape(counts)
+    values = np.pad(values, 1, constant_values=cell)  # Closed where the matter goes on beyond what is drawn.
+    vertices, faces, *_ = marching_cubes(values, 0.0, spacing=(cell,) * 3, gradient_direction="descent")
+    return clean(Mesh(vertices + start - cell, faces.astype(np.int64)))
 
 
 def _write_assets(
