@@ -17,10 +17,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
-from sdfsim.apps.export import export
+from sdfsim.apps.export import convex_pieces, export
 from sdfsim.apps.observed import load_recordings
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
@@ -527,6 +527,25 @@ shapes: {{s: {{asset: {shapes}/cone}}}}
 
 def assets(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_an_open_surface_is_cut_as_the_solid_of_its_distance(tmp_path, monkeypatch):
+    """Scenery from photos is drawn as photos show it, without a back, and collides as a closed solid."""
+    solid = primitives.box()
+    shape = mesh_shape(solid, name="scenery", kind="grid", resolution=33)
+    drawn = replace(shape, mesh=Mesh(solid.vertices, solid.faces[2:]))
+    given = []
+
+    def cut(name: str, mesh: Mesh, warn: bool) -> dict[str, Any]:
+        given.append(mesh)
+        return {"vertices": mesh.vertices, "count": [len(mesh.vertices)]}
+
+    monkeypatch.setattr("sdfsim.apps.export._cut", cut)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (piece,) = convex_pieces(drawn)
+    assert is_closed(given[0])
+    np.testing.assert_allclose(np.ptp(piece.vertices, axis=0), np.ptp(solid.vertices, axis=0), rtol=0.03)
+    assert signed_volume(piece) == pytest.approx(signed_volume(solid), rel=0.05)
 
 
 def test_a_solid_without_pieces_is_cut_once_by_coacd(tmp_path, monkeypatch, caplog):
