@@ -100,17 +100,11 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
         return mesh, f"there are only {len(pictures)} photos, it takes {FEWEST}"
     if count < EVERY:
         return mesh, f"it has only {count} vertices, it takes {EVERY}"
-    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
-    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
-    links = ((links + links.T) > 0).astype(float)
-    mean = diags(1 / np.asarray(links.sum(1)).ravel()) @ links
+    mean = mean_of_neighbours(mesh)
     low = height(mesh.vertices) < layer
     upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
     for number in range(ROUNDS):
-        normal = usual = vertex_normals(mesh)
-        for _ in range(4):
-            normal = normal + mean @ normal
-            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        usual, normal = vertex_normals(mesh), smooth_normals(mesh, mean)
         for _ in range(NEAR):
             usual = mean @ usual
         # Around a rim normals differ. A patch there shows what lies behind, and no photo agrees on a place.
@@ -157,6 +151,24 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
             vertices = vertices + share * (known * ~low)[:, None] * (mean @ vertices - vertices)
         mesh = replace(mesh, vertices=vertices)
     return mesh, ""
+
+
+def mean_of_neighbours(mesh: Mesh) -> csr_matrix:
+    """The matrix [V, V] that takes the mean over the neighbours of each vertex."""
+    count = len(mesh.vertices)
+    edges = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    links = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count)).tocsr()
+    links = ((links + links.T) > 0).astype(float)
+    return (diags(1 / np.asarray(links.sum(1)).ravel()) @ links).tocsr()
+
+
+def smooth_normals(mesh: Mesh, mean: csr_matrix) -> np.ndarray:
+    """Unit normals [V, 3] of vertices without the noise of the finest triangles."""
+    normal = vertex_normals(mesh)
+    for _ in range(4):
+        normal = normal + mean @ normal
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return normal
 
 
 def patch_correlation(

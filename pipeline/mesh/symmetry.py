@@ -20,10 +20,11 @@ from scipy.spatial import KDTree
 
 from pipeline.cameras import View, frame_of
 from pipeline.mesh.extraction import Volume, components, keep_faces, sample_box
+from pipeline.mesh.photo_refining import mean_of_neighbours, smooth_normals
 from pipeline.mesh.trust import FEW, Evidence
 from pipeline.mesh.visibility import framed
 from sdfsim.geometry.bvh import Caster, ClosestPoint
-from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
+from sdfsim.geometry.mesh import Mesh, face_normals
 
 FINER = 0.5  # cells of the field between samples, so that a completed body keeps its detail
 SURE = 0.5  # cells of the field: largest uncertainty of a place that is known, see `Evidence`
@@ -84,7 +85,7 @@ class Known:
         self.mesh, self.cell, self.views, self.blocking = mesh, cell, views, blocking
         self.seen = (evidence.views >= FEW) & (evidence.uncertainty < SURE * cell)  # [V]
         self._near = ClosestPoint(mesh)
-        self.normals = vertex_normals(mesh)
+        self.normals = smooth_normals(mesh, mean_of_neighbours(mesh))
         low, high = mesh.vertices.min(0) - 3 * cell, mesh.vertices.max(0) + 3 * cell
         self.volume = sample_box(self.distance, low, high, FINER * cell)
         self.trust = replace(self.volume, values=self._trust())
