@@ -24,7 +24,7 @@ from pipeline.mesh.photo_refining import mean_of_neighbours, smooth_normals
 from pipeline.mesh.trust import FEW, Evidence
 from pipeline.mesh.visibility import framed
 from sdfsim.geometry.bvh import Caster, ClosestPoint
-from sdfsim.geometry.mesh import Mesh, face_normals
+from sdfsim.geometry.mesh import Mesh, face_normals, vertex_normals
 
 FINER = 0.5  # cells of the field between samples, so that a completed body keeps its detail
 SURE = 0.5  # cells of the field: largest uncertainty of a place that is known, see `Evidence`
@@ -85,7 +85,7 @@ class Known:
         self.mesh, self.cell, self.views, self.blocking = mesh, cell, views, blocking
         self.seen = (evidence.views >= FEW) & (evidence.uncertainty < SURE * cell)  # [V]
         self._near = ClosestPoint(mesh)
-        self.normals = smooth_normals(mesh, mean_of_neighbours(mesh))
+        self.normals, self.smooth = vertex_normals(mesh), smooth_normals(mesh, mean_of_neighbours(mesh))
         low, high = mesh.vertices.min(0) - 3 * cell, mesh.vertices.max(0) + 3 * cell
         self.volume = sample_box(self.distance, low, high, FINER * cell)
         self.trust = replace(self.volume, values=self._trust())
@@ -149,13 +149,13 @@ def axis_of(known: Known, up: np.ndarray) -> Symmetry | None:
         axis = up + values[2] * frame[0] + values[3] * frame[1]
         return middle + size * (values[0] * frame[0] + values[1] * frame[1]), axis / np.linalg.norm(axis)
 
-    def sine(values: np.ndarray) -> np.ndarray:
+    def sine(values: np.ndarray, normals: np.ndarray = normals) -> np.ndarray:
         point, axis = line(values)
         around = np.cross(axis, points - point)
         return (normals * around).sum(1) / np.maximum(np.linalg.norm(around, axis=1), 0.05 * size)
 
     found = least_squares(sine, np.zeros(4), loss="soft_l1", f_scale=MEETS / 2, max_nfev=50)
-    if (np.abs(sine(found.x)) < MEETS).mean() < ROUND:
+    if (np.abs(sine(found.x, known.smooth[index])) < MEETS).mean() < ROUND:  # The noise is not what the body is like.
         return None
     return Symmetry(REVOLUTION, *line(found.x))
 

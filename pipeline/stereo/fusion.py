@@ -29,8 +29,8 @@ OUTVOTED = 0.5  # a majority
 # cells behind a surface is empty if more than a share `FACING` of the `NEAREST` nearest points of surfaces face it. So
 # many, because the very nearest points to the middle of a thin wall are near only because they are wrong. Less than
 # half, because fewer points are known of the inside of a vase than of its outside.
-DEEP, NEAREST, FACING = 0.5, 32, 0.4  # chosen of six pairs on one vase, the bundled set's, and on one drawn thin board
-SURFACE_POINTS = 10_000  # per photo, for this search
+DEEP, NEAREST, FACING = 0.5, 96, 0.4  # chosen of six pairs on one vase, the bundled set's, and on one drawn thin board
+SURFACE_POINTS = 30_000  # per photo, for this search
 SEEN = 0.3  # weight above which a place is known; one certain pixel has 1. Set by hand
 EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface; by hand
 LEAST_TILT = 0.15  # cosine of the flattest angle that counts; by hand
