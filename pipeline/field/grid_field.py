@@ -1,9 +1,9 @@
-"""The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through the surface's haze.
+"""The volumetric field: an SDF and a colour on dense multi-resolution grids, rendered through a soft surface.
 
-The haze is VolSDF's Laplace distribution (Yariv et al., 2021, section 3.1), but what it hides of a ray is NeuS's (Wang
-et al., 2021, eq. 10 to 13): half of it where the surface is, also for a ray that only grazes it. VolSDF's density hides
-half of a grazing ray at three times the haze's scale already, and training moved edges inwards by as much. Space is the
-unit sphere; a separate background outside of it uses contracted coordinates (Barron et al., 2022, eq. 10).
+The transmittance along a ray is NeuS's (Wang et al., 2021, eq. 10 to 13), with VolSDF's Laplace distribution (Yariv et
+al., 2021, section 3.1): half at the surface, also of a ray that only grazes it. VolSDF's own density hides half of such
+a ray about three scales outside of the surface, so that training moves edges inwards. Space is the unit sphere; a
+separate background outside of it uses contracted coordinates (Barron et al., 2022, eq. 10).
 """
 
 from __future__ import annotations

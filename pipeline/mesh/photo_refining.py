@@ -104,11 +104,11 @@ def refine(mesh: Mesh, pictures: list[GreyPhoto], blocking: Caster, lift: float,
     low = height(mesh.vertices) < layer
     upright = height(np.eye(3)) - height(np.zeros((1, 3))) if low.any() else np.zeros(3)
     for number in range(ROUNDS):
-        usual, normal = vertex_normals(mesh), smooth_normals(mesh, mean)
+        common, normal = vertex_normals(mesh), smooth_normals(mesh, mean)
         for _ in range(NEAR):
-            usual = mean @ usual
+            common = mean @ common
         # Around a rim normals differ. A patch there shows what lies behind, and no photo agrees on a place.
-        flat = ((np.linalg.norm(usual, axis=1) - RIM) / (FLAT - RIM)).clip(0, 1)
+        flat = ((np.linalg.norm(common, axis=1) - RIM) / (FLAT - RIM)).clip(0, 1)
         picked = np.random.default_rng(number).permutation(count)[: count // EVERY]
         moves = np.linspace(-1, 1, PLACES) * REACH * finest / (1 if number + 1 < ROUNDS else 2)
         score = patch_correlation(Visibility(mesh, lift, blocking).at(picked), normal[picked], pictures, moves)

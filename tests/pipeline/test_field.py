@@ -39,7 +39,7 @@ from tests.helpers.sparse import NOTHING
 
 
 def laplace(distance: float, beta: float) -> float:
-    """The share of the light that the haze of a surface lets through, from the Laplace distribution function."""
+    """The transmittance at a signed distance from a surface: the Laplace distribution function."""
     return 1 - 0.5 * np.exp(-distance / beta) if distance > 0 else 0.5 * np.exp(distance / beta)
 
 
