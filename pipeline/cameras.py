@@ -65,8 +65,8 @@ class View:
         local = points @ self.rotation.T + self.translation
         depth = local[:, 2]
         xy = local[:, :2] / np.where(np.abs(depth) < 1e-12, 1e-12, depth)[:, None]
-        scale = self.focal * (1 + self.k * (xy**2).sum(1, keepdims=True))
-        return scale * xy + [self.cx, self.cy], depth
+        scale = self.focal * (1 + self.k * np.einsum("pi,pi->p", xy, xy))
+        return scale[:, None] * xy + [self.cx, self.cy], depth
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ class Settings:
 
 PRESETS = {
     "quick": Settings(),
-    "standard": Settings(iterations=7500, rays=768, samples=40, long_side=800, stereo=800, beta=(0.1, 0.0025)),
+    "standard": Settings(iterations=3000, rays=768, samples=40, long_side=800, stereo=800, beta=(0.1, 0.0025)),
 }
 
 
@@ -410,7 +410,7 @@ class Trained:
 def train(
     poses: PosedPhotos, photos_folder: Path, out: Path, *, settings: Settings,
     budget: float | None = None, seed: int = 0, device: str = "cpu", threads: int | None = None,
-    checkpoint_every: float = 20.0, on_progress: Progress = silent,
+    checkpoint_every: float = 60.0, on_progress: Progress = silent,
 ) -> Trained:  # fmt: skip
     """Trains a field and writes `field.safetensors` and `field.json` to `out`; resumes from `checkpoint.safetensors`.
 

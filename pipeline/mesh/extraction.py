@@ -100,11 +100,9 @@ def sample_volume(
 ) -> Volume:
     """Samples over [-extent, extent]^3, `resolution` a side (rounded up to a multiple of `coarse` plus 1), fine only
     near the surface of a distance [P] at points [P, 3]: a factor of 2 is left for fields that are not quite SDFs."""
-    count = -(-(resolution - 1) // coarse) * coarse + 1
-    line = np.linspace(-extent, extent, count, dtype=np.float32)
-    reach = 2.0 * np.sqrt(3) * (line[coarse] - line[0])
-    values = near_samples(partial(sample, distance), line, coarse, reach, on_progress)
-    return Volume(values, np.full(3, -extent), 2 * extent / (count - 1))
+    count = -(-(resolution - 1) // coarse) * coarse
+    corner = np.full(3, extent)
+    return sample_near(distance, -corner, corner, 2 * extent / count, coarse, on_progress)
 
 
 def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: float) -> Volume:
@@ -112,6 +110,17 @@ def sample_box(distance: Distance, low: np.ndarray, high: np.ndarray, cell: floa
     counts = np.ceil((np.asarray(high) - low) / cell).astype(int) + 1
     empty = Volume(np.empty(counts, np.float32), np.asarray(low, float), cell)
     return replace(empty, values=sample(distance, empty.points().reshape(-1, 3)).reshape(counts))
+
+
+def sample_near(distance: Distance, low: np.ndarray, high: np.ndarray, cell: float, coarse: int = 4,
+                on_progress: Progress = silent) -> Volume:  # fmt: skip
+    """Samples in the box between two corners [3], `cell` apart, fine only near the surface, see `sample_volume`; the
+    box is made longer to hold whole blocks of `coarse` cells."""
+    counts = coarse * np.ceil((high - low) / (coarse * cell) - 1e-6).astype(int) + 1
+    volume = Volume(np.empty(counts, np.float32), np.asarray(low, float), cell)
+    # No point of a block is farther from a corner than half of its diagonal.
+    reach = np.sqrt(3) * coarse * cell
+    return replace(volume, values=near_samples(partial(sample, distance), [line.astype(np.float32) for line in volume.axes()], coarse, reach, on_progress))
 
 
 @dataclass(frozen=True)

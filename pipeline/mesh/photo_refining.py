@@ -28,7 +28,7 @@ LONG_SIDE = 640  # px; larger photos are reduced, because otherwise the right pl
 PHOTOS, FEWEST = 6, 3
 PATCH = np.indices((7, 7)).reshape(2, -1).T.astype(np.float32) - 3  # [G, 2] px from a patch's middle
 NOISE = 4.0  # grey levels squared: variance that is no texture
-PLACES = 25  # tried along the normal
+PLACES = 15  # tried along the normal
 # Largest move of vertices per round, in cells of the field's finest grid, and rounds; half as far in the last.
 REACH, ROUNDS = 1.3, 3
 BATCH = 400  # vertices compared at once; their patches take 10 MB

@@ -62,8 +62,7 @@ class Visibility:
     def of_place(self, place: np.ndarray, among: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Vertices [S], of those `among` [V] bool, in sight of a place [3], and cosines [S] as in `of_view`."""
         towards = place - self.vertices
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        cosine = (towards * self.normals).sum(1)
+        cosine = np.einsum("vi,vi->v", towards, self.normals) / np.sqrt(np.einsum("vi,vi->v", towards, towards))
         index = np.flatnonzero(among & (cosine > FLATTEST))
         index = index[~self._blocking.blocked(self._from[index], place)]
         return index, cosine[index]
@@ -72,7 +71,8 @@ class Visibility:
 def framed(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [P, 2] of points [P, 3], and whether they lie within the picture [P]."""
     pixels, depth = view.project(points)
-    return pixels, (depth > 0) & (pixels > 1).all(1) & (pixels < [view.width - 1, view.height - 1]).all(1)
+    u, v = pixels.T
+    return pixels, (depth > 0) & (u > 1) & (v > 1) & (u < view.width - 1) & (v < view.height - 1)
 
 
 def look(sight: Visibility, views: Sequence[View], photos_folder: Path, on_progress: Progress = silent) -> PhotoColors:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -113,7 +113,7 @@ def sample_grid(
         # No point of a block is farther from a corner than half of its diagonal; a quarter of a side more adds a
         # margin.
         reach = (0.5 * np.sqrt(3.0) + 0.25) * (axis[coarse] - axis[0])
-        values = near_samples(ask, axis, coarse, reach, on_progress)
+        values = near_samples(ask, [axis] * 3, coarse, reach, on_progress)
     else:
         values = np.empty((resolution, resolution, resolution), dtype=np.float32)
         for k, x in enumerate(axis):
@@ -124,19 +124,23 @@ def sample_grid(
 
 
 def near_samples(
-    distance: Callable[[np.ndarray], np.ndarray], axis: np.ndarray, coarse: int, reach: float, on_progress: Progress
-) -> np.ndarray:
-    """Samples [R, R, R] float32 of a distance [P] at points [P, 3], at evenly spaced places [R] along each axis. Blocks
-    of `coarse` cells a side, which divides R - 1, are sampled in full only where a corner is within `reach` of the
-    surface or not all corners are on one side of it; others are sampled at their corners, and trilinear between."""
+    distance: Callable[[np.ndarray], np.ndarray], axes: Sequence[np.ndarray], coarse: int, reach: float,
+    on_progress: Progress = silent,
+) -> np.ndarray:  # fmt: skip
+    """Samples [X, Y, Z] float32 of a distance [P] at points [P, 3], at evenly spaced places along three axes. Blocks of
+    `coarse` cells a side, which divides X - 1, Y - 1 and Z - 1, are sampled in full only where a corner is within
+    `reach` of the surface or not all corners are on one side of it; others are sampled at their corners, and trilinear
+    between."""
     from scipy.ndimage import zoom
 
-    knots = axis[::coarse]
-    count, places = len(knots) - 1, lattice(knots, knots, knots)
+    knots = [axis[::coarse] for axis in axes]
+    places = lattice(*knots)
     rough = np.concatenate([distance(part) for part in np.array_split(places, len(places) // CHUNK + 1)])
-    rough = rough.reshape((count + 1,) * 3)
-    values = np.asarray(zoom(rough, len(axis) / len(knots), order=1, grid_mode=False, mode="nearest"), np.float32)
-    corners = np.stack([rough[i : i + count, j : j + count, k : k + count] for i, j, k in np.ndindex(2, 2, 2)])
+    rough = rough.reshape([len(line) for line in knots])
+    wider = [len(axis) / len(line) for axis, line in zip(axes, knots, strict=True)]
+    values = np.asarray(zoom(rough, wider, order=1, grid_mode=False, mode="nearest"), np.float32)
+    x, y, z = (len(line) - 1 for line in knots)
+    corners = np.stack([rough[i : i + x, j : j + y, k : k + z] for i, j, k in np.ndindex(2, 2, 2)])
     crossed = corners.min(0) * corners.max(0) < 0
     blocks = np.argwhere((np.abs(corners).min(0) <= reach) | crossed)
     inner = lattice(*[np.arange(coarse + 1)] * 3)
@@ -144,6 +148,7 @@ def near_samples(
     for number, part in enumerate(parts):
         on_progress(number / len(parts), f"sampling near the surface, {number + 1} of {len(parts)} parts")
         place = (coarse * part[:, None] + inner).reshape(-1, 3)
-        values[tuple(place.T)] = distance(axis[place])
+        points = np.stack([axis[index] for axis, index in zip(axes, place.T, strict=True)], 1)
+        values[tuple(place.T)] = distance(points)
     on_progress(1.0, "sampled")
     return values
