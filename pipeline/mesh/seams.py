@@ -230,8 +230,10 @@ def _half(solid: ConnectedSolid, mine: np.ndarray, groove: np.ndarray, colors: n
     degree = np.asarray(link.sum(1)).ravel()
     root = diags(degree**-0.5)
     start = np.random.default_rng(0).normal(size=len(whole))
-    value = eigsh(root @ link @ root + identity(len(whole)), k=2, which="LA", v0=start, tol=1e-5)[1][:, 0]  # type: ignore[arg-type]
-    value = value * degree**-0.5
+    laplacian = (identity(len(whole)) - root @ link @ root).tocsc()
+    # The smallest two eigenvalues are close; of the inverse they are far apart.
+    values, vectors = eigsh(laplacian, k=2, sigma=-1e-6, which="LM", v0=start)
+    value = vectors[:, values.argmax()] * degree**-0.5
     limits = np.quantile(value, np.linspace(LEAST_PART, 1 - LEAST_PART, 60))
     row, column = link.nonzero()
     strength = np.asarray(link[row, column]).ravel()
