@@ -68,6 +68,10 @@ class MeshDistance:
         """Reference values at `points` [P, 3] m."""
         return _in_chunks(self._chunk, points)
 
+    def closest(self, points: np.ndarray) -> np.ndarray:
+        """The points [P, 3] m of the surface that are nearest to others [P, 3] m."""
+        return self(points).closest if self.solid.thickness else self._nearest(points)[0]
+
     def _chunk(self, points: np.ndarray) -> Reference:
         closest, normal = self._nearest(points)
         offset = points - closest

@@ -5,6 +5,7 @@ import numpy as np
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh, lattice, normal_frame
 from sdfsim.geometry.primitives import spiral
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.sdf import Sdf
 
 # The paper's sampling (section 3 and appendix): a grid over this half extent of the normalised frame, projected onto
@@ -31,12 +32,12 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
     frame = normal_frame(sdf.bounds)
     axis = np.linspace(-GRID_HALF, GRID_HALF, grid)
     points = project(sdf, frame.outward(lattice(axis, axis, axis)))
-    distance = np.asarray(sdf(points)[0])
-    reached = np.abs(distance) <= REACHED * frame.scale
     # A network may have a stray zero level in the corners of its box, so nothing outside the solid's bounds counts as
     # surface.
     margin = REACHED * frame.scale
-    reached &= ((points >= sdf.bounds[0] - margin) & (points <= sdf.bounds[1] + margin)).all(1)
+    reached = ((points >= sdf.bounds[0] - margin) & (points <= sdf.bounds[1] + margin)).all(1)
+    if not isinstance(sdf, MeshSdf):
+        reached &= np.abs(np.asarray(sdf(points)[0])) <= margin
     points = points[reached]
     if len(points) == 0:
         raise SdfsimError("no surface nodes: the SDF has no zero level within its bounds")
@@ -44,7 +45,9 @@ def sample_nodes(sdf: Sdf, *, grid: int = DEFAULT_GRID, voxel: float = VOXEL) ->
 
 
 def project(sdf: Sdf, points: np.ndarray) -> np.ndarray:
-    """Move points [P, 3] m to the zero level by a few steps x - f grad f / |grad f|^2."""
+    """Move points [P, 3] m to the zero level: exactly for a mesh, else by a few steps x - f grad f / |grad f|^2."""
+    if isinstance(sdf, MeshSdf):
+        return sdf.closest(points)
     for _ in range(PROJECTIONS):
         distance, gradient = sdf(points)
         # A step is at most twice the distance: slopes below 0.7 are errors of a fit, not geometry.
