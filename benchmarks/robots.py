@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.records import Cell, progress, write_record
 from sdfsim import Simulator, export, load_scene
+from sdfsim.apps.export import plain_names
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Joint, Scene
@@ -118,7 +119,9 @@ def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
         if number := [k for k in range(model.nkey) if (model.key(k).name or f"key {k}") == key]:
             mujoco.mj_resetDataKeyframe(model, data, number[0])
         # Hinges and slides, all from the export's start, which is within limits.
-        single = {model.joint(j).name: model.jnt_qposadr[j] for j in np.flatnonzero(model.jnt_type > 1)}
+        chosen = np.flatnonzero(model.jnt_type > 1)
+        names = plain_names([model.joint(j).name for j in chosen])  # as an export writes them
+        single = dict(zip(names, model.jnt_qposadr[chosen], strict=True))
         for name, at in single.items():
             data.qpos[at] = start.setdefault(name, float(data.qpos[at]))
         while data.time < SECONDS - 1e-9:

@@ -120,7 +120,8 @@ def sample_near(distance: Distance, low: np.ndarray, high: np.ndarray, cell: flo
     volume = Volume(np.empty(counts, np.float32), np.asarray(low, float), cell)
     # No point of a block is farther from a corner than half of its diagonal.
     reach = np.sqrt(3) * coarse * cell
-    return replace(volume, values=near_samples(partial(sample, distance), [line.astype(np.float32) for line in volume.axes()], coarse, reach, on_progress))
+    lines = [line.astype(np.float32) for line in volume.axes()]  # as fields take them
+    return replace(volume, values=near_samples(partial(sample, distance), lines, coarse, reach, on_progress))
 
 
 @dataclass(frozen=True)
