@@ -167,7 +167,7 @@ STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
     "poses": Stage(do_poses, "poses", version=9),
     "distill": Stage(do_distill, "distill", version=15),
-    "mesh": Stage(do_mesh, "mesh", version=20),
+    "mesh": Stage(do_mesh, "mesh", version=21),
     "fit": Stage(do_fit, "assets", version=4),
     "scene": Stage(do_scene, "scene", version=8),
 }
