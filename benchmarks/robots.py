@@ -34,9 +34,10 @@ FREE = 1.0  # rad or m to each side, of joints without limits
 
 
 def simulator_of(scene: Scene) -> Simulator:
-    """A simulator of a scene without what closes loops or couples joints."""
+    """A simulator of a scene without what closes loops or couples joints; nothing collides, so no shape is prepared."""
     trees = tuple(joint for joint in scene.joints if not joint.collides)
-    return Simulator(replace(scene, model="solver", joints=trees, couplings=(), keyframes={}))
+    bodies = tuple(replace(body, collides_with=()) for body in scene.bodies)
+    return Simulator(replace(scene, model="solver", bodies=bodies, joints=trees, couplings=(), keyframes={}))
 
 
 def poses(simulator: Simulator, q: dict[str, float | np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +112,11 @@ def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
     keys = mujoco.MjModel.from_xml_path(str(source))
     key = (keys.key(0).name or "key 0") if keys.nkey else "start"
     for file in (scene.with_suffix(".xml"), source):
-        model = mujoco.MjModel.from_xml_path(str(file))
+        spec = mujoco.MjSpec.from_file(str(file))
+        for geom in spec.geoms:
+            if geom.type == mujoco.mjtGeom.mjGEOM_SDF:  # its octree would take minutes
+                geom.type = mujoco.mjtGeom.mjGEOM_MESH
+        model = spec.compile()
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
         data, forces = mujoco.MjData(model), []
         if not model.nu:

@@ -18,7 +18,7 @@ from sdfsim.base.files import user_cache
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, lattice, signed_volume
+from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, joined, lattice, signed_volume
 from sdfsim.geometry.mesh_io import GLTF, Loaded, load_textured
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
@@ -331,7 +331,11 @@ def fit_pieces(
 
     def pick(sdf: Sdf) -> np.ndarray:
         own = hull_nodes(vertices, round(OWN_SHARE * nodes))
-        return thin(sample_nodes(sdf), nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
+        try:
+            spread = sample_nodes(sdf)
+        except SdfsimError:  # Pieces between the samples of a grid still have corners and edges.
+            spread = vertices
+        return thin(spread, nodes, keep=thin(edges, round(EDGE_SHARE * nodes), keep=own))
 
     if kind == "grid":
         sdf: Sdf = sample_grid(oracle, oracle.bounds, DEFAULT_RESOLUTION)
@@ -342,8 +346,10 @@ def fit_pieces(
 
         sdf, points, certificate = fit_sdf(oracle, "default", None, 0, pick, silent, "cpu")
         source = {"kind": "pieces", "recipe": "default", "fit_version": FIT_VERSION}
-    single = len(pieces) == 1 and is_closed(pieces[0])
-    volume, com, inertia = mass_properties(pieces[0]) if single else mass_properties_of_sdf(oracle, oracle.bounds)
+    low, high = (np.array([edge(piece.vertices, 0) for piece in pieces]) for edge in (np.min, np.max))
+    apart = ((low[:, None] > high) | (low > high[:, None])).any(2) | np.eye(len(pieces), dtype=bool)
+    exact = apart.all() and all(is_closed(piece) for piece in pieces)  # what overlaps would count twice
+    volume, com, inertia = mass_properties(joined(pieces)) if exact else mass_properties_of_sdf(oracle, oracle.bounds)
     mesh = display if display is not None else clean(oracle.surface, name=name)
     hulls = tuple(piece.vertices for piece in pieces)
     return Shape(name, mesh, sdf, points, volume, com, inertia, certificate, source, hulls)

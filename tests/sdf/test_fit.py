@@ -117,6 +117,15 @@ def test_pieces_keep_their_own_vertices_as_nodes(monkeypatch: pytest.MonkeyPatch
     np.testing.assert_allclose(shape.inertia, np.eye(3) / 6, rtol=0.03, atol=1e-3)
 
 
+def test_pieces_between_the_samples_of_a_grid_keep_their_corners():
+    cube = primitives.box((0.001, 0.001, 0.001))
+    pieces = [Mesh(cube.vertices + np.array([x, y, 0.0]), cube.faces) for x in (-0.25, 0.25) for y in (-0.1, 0.1)]
+    shape = fit_pieces(pieces, name="feet", kind="grid")
+    corners = np.concatenate([piece.vertices for piece in pieces])
+    assert np.abs(shape.nodes[:, None] - corners).sum(2).min(0).max() < 1e-9
+    assert shape.volume == pytest.approx(4 * 0.001**3, rel=0.05)
+
+
 def test_a_shape_with_mirror_planes_is_fitted_on_one_side(tiny: None) -> None:
     cone = fit_mesh(primitives.cone(), name="cone").sdf
     assert isinstance(cone, MlpSdf)
