@@ -3,7 +3,8 @@ import pytest
 from scipy.spatial import KDTree
 
 from sdfsim.geometry import primitives
-from sdfsim.geometry.mesh import Mesh, sample_surface
+from sdfsim.geometry.mesh import Mesh, joined, sample_surface
+from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.surface_nodes import _reaching, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
@@ -110,3 +111,14 @@ def test_of_a_flat_sheet_its_rim_reaches_farthest() -> None:
     x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
     corners = _reaching(np.stack([x, y, 0 * x], -1).reshape(-1, 3), 170)
     assert len(corners) == 4 and (np.abs(corners[:, :2]) == 1.0).all()
+
+
+def test_nodes_of_boxes_that_cross_lie_on_their_union():
+    long, wide = primitives.box((1.0, 0.2, 0.2)), primitives.box((0.2, 1.0, 0.3))
+    solid = solidify(joined([long, wide])).surface
+    nodes = surface_nodes(MeshSdf(solid), solid, 512)
+    outside = [np.abs(nodes) - 0.5 * np.array(size) for size in ((1.0, 0.2, 0.2), (0.2, 1.0, 0.3))]
+    off = np.abs(np.minimum(*(part.max(1) for part in outside)))
+    # At the crease faces are cut to the width of `FINE` of the normalised solid.
+    assert np.quantile(off, 0.95) < 1e-6 and off.max() < 0.005
+    assert len(nodes) > 400
