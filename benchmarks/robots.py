@@ -30,6 +30,7 @@ from sdfsim.scene.scene import Joint, Scene
 
 TRIES = 20
 SECONDS = 2.0  # of motion in MuJoCo
+ROUNDING = 1e-6  # N or N m: at a keyframe where actuators hold nothing, their forces are noise below this
 FREE = 1.0  # rad or m to each side, of joints without limits
 
 
@@ -104,7 +105,7 @@ def judge(source: Path, scene: Scene, *, tries: int = TRIES, seed: int = 0) -> J
 def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
     """The largest difference (rad, m) of a joint's position after `SECONDS` in MuJoCo between an MJCF file and an
     export of the `scene` made from it, and how often in each forces of actuators change their sign by more than a
-    thousandth of the largest. None if it has no actuators."""
+    thousandth of the largest and more than rounding. None if it has no actuators."""
     import mujoco
 
     export(scene, scene.with_suffix(".xml"), collide="sdf")  # nothing touches: no need to cut meshes
@@ -133,7 +134,8 @@ def there_and_back(source: Path, scene: Path) -> tuple[float, int, int] | None:
             mujoco.mj_step(model, data)
             forces.append(data.actuator_force.copy())
         force = np.array(forces)
-        sign = np.sign(np.where(np.abs(force) > 1e-3 * np.abs(force).max(), force, 0.0))
+        least = max(1e-3 * np.abs(force).max(), ROUNDING)
+        sign = np.sign(np.where(np.abs(force) > least, force, 0.0))
         turns.append(int((sign[1:] * sign[:-1] < 0).sum()))
         ends.append({name: float(data.qpos[at]) for name, at in single.items()})
     return max(abs(ends[0][name] - end) for name, end in ends[1].items() if name in ends[0]), turns[1], turns[0]

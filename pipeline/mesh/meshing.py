@@ -15,7 +15,15 @@ from pipeline.inputs.captures import load_capture
 from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, open_photo
 from pipeline.materials import SCENERY, SURROUNDINGS
 from pipeline.mesh.bodies import Parts, split
-from pipeline.mesh.extraction import Distance, FieldSurface, ball, field_distance, sample_volume, surface_of
+from pipeline.mesh.extraction import (
+    Distance,
+    FieldSurface,
+    all_seen,
+    ball,
+    field_distance,
+    sample_volume,
+    surface_of,
+)
 from pipeline.mesh.hollows import hollow
 from pipeline.mesh.joint import JOINT, PART, HeldPart, load_held
 from pipeline.mesh.placement import GRAVITY, Placement, Scale, Up, given_up, located_bodies, measured_scale, place
@@ -83,6 +91,7 @@ def make_meshes(
                              on_progress=share_of(on_progress, 0.5, 0.2))  # fmt: skip
         # If the user has cropped the surroundings away, the rest is meant to move.
         alone = alone or (edge is not ball and bool((ball(surface.solid.vertices) < -2 * volume.cell).all()))
+    surface = all_seen(surface, edge)
     on_progress(0.7, "looking for bodies")
     parts = split(surface, inside, field.finest, posed, photos, level, alone=alone, clicked=clicked)
     on_progress(0.8, "drawing objects.png")

@@ -26,9 +26,7 @@ from sdfsim.base.parallel import Progress, silent
 # all. On the bundled set 14 of 48 gave the same poses as all pairs, in a third of the time.
 PARTNERS, SHARE = (14, 40), 0.25
 ORDINARY: dict[str, Any] = {
-    # COLMAP keeps whole levels of detail, so up to three times `max_features`; no more than `largest` of them stay, 0
-    # for all: the thresholds here were chosen with all.
-    "pixels": 1000, "max_features": 3000, "largest": 0, "peak_threshold": 0.0066667, "max_ratio": 0.8,
+    "pixels": 1000, "features": 7000, "contrast": 0.02, "max_ratio": 0.8,
     "moving_only": False, "min_inliers": 15, "min_inlier_ratio": 0.35, "init_inliers": 100, "init_angle": 16.0,
     "pose_inliers": 30, "exhaustive_up_to": 30,
     "all_up_to": 150,  # photos; beyond this, pairs that do not look alike are never matched
@@ -44,7 +42,7 @@ ATTEMPTS = {
     "without static matches": {**ORDINARY, "moving_only": True},
     "more matches": {**ORDINARY, **CAREFUL, "all_up_to": 0},
     "more features": {
-        **ORDINARY, **CAREFUL, "pixels": 1600, "max_features": 12000, "largest": 12000, "peak_threshold": 0.003,
+        **ORDINARY, **CAREFUL, "pixels": 1600, "features": 12000, "contrast": 0.009,
         "exhaustive_up_to": 40, "all_up_to": 40,  # A pair takes most of a second.
     },
 }  # fmt: skip
@@ -104,7 +102,7 @@ def solve(photos: list[Photo], photos_folder: Path, out: Path, *, seed: int = 0,
     """
     known = photos_folder / KNOWN_CAMERAS
     job = {
-        "version": 7,  # of the child's files, which a resumed run reads
+        "version": 8,  # of the child's files, which a resumed run reads
         "images": str(photos_folder / "images"), "count": len(photos), "groups": size_groups(photos), "seed": seed,
         "masks": str(photos_folder / "masks") if all(p.mask for p in photos) else "",
         "known_cameras": str(known) if known.exists() else "", "refine": load_capture(photos_folder) is not None,

@@ -5,7 +5,16 @@ import pytest
 
 from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, camera_up
 from pipeline.field.supervision import unit_sphere_of
-from pipeline.mesh.extraction import belonging, components, islands, sample_box, sample_volume, trusted_vertices
+from pipeline.mesh.extraction import (
+    FieldSurface,
+    all_seen,
+    belonging,
+    components,
+    islands,
+    sample_box,
+    sample_volume,
+    trusted_vertices,
+)
 from pipeline.mesh.placement import Scale, find_up, load_placement, place, plane_up, resting_height
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.bvh import Caster
@@ -188,3 +197,19 @@ def test_cameras_and_points_move_together_and_know_from_where():
     np.testing.assert_allclose(after.moved_by.points(before.sparse.xyz), after.sparse.xyz)
     back = after.moved_by.inverse().points(after.views[3].center)
     np.testing.assert_allclose(back, before.views[3].center, atol=1e-12)
+
+
+def test_all_that_photos_see_of_the_solid_is_shown_but_no_cut_and_no_back():
+    """A ball cut off at its top, of which only a half was shown before; photos see all but its underside."""
+    volume = sample_volume(ball(), 65)
+    limit = lambda p: p[:, 2] - 0.3  # noqa: E731
+    raw = volume.limited(limit).mesh()
+    height = raw.vertices[:, 2]
+    few = raw.vertices[:, 0] > 0
+    before = FieldSurface(volume, raw, few, np.ones(len(raw.faces), bool), few[raw.faces].all(1), [],
+                          np.where(height > -0.2, 2, 0))  # fmt: skip
+    shown = all_seen(before, limit).shown
+    middle = raw.vertices[raw.faces].mean(1)[:, 2]
+    assert shown[(middle > -0.15) & (middle < 0.2)].all()
+    assert not shown[middle < -0.4].any()
+    assert not shown[middle > 0.28].any()
