@@ -165,9 +165,9 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
-    "poses": Stage(do_poses, "poses", version=9),
+    "poses": Stage(do_poses, "poses", version=10),
     "distill": Stage(do_distill, "distill", version=15),
-    "mesh": Stage(do_mesh, "mesh", version=21),
+    "mesh": Stage(do_mesh, "mesh", version=22),
     "fit": Stage(do_fit, "assets", version=4),
     "scene": Stage(do_scene, "scene", version=8),
 }
