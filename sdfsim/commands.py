@@ -461,7 +461,8 @@ def stress(
     ] = None,
     device: str = "auto",
 ) -> None:
-    """Hard cases with every model and the teacher (PyBullet): a table, plots, and recordings of what went wrong."""
+    """Hard cases with the solver, PyBullet and the models that you name: a table, plots, and recordings of what
+    went wrong."""
     from sdfsim.apps import stress as study
     from sdfsim.base.lazy import pyplot
 

@@ -899,9 +899,11 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     tree, joint_names, every = jointed.trees(take.scene), _joint_names(take), list(take.each())
     links = dict(enumerate(take.names)) | {-1: "world"}
     robots: dict[int, tuple[XML, Path]] = {}  # by their bodies
+    roots: dict[int, str] = {}
     for k in tree.order:
         (name, body, shape, color), above = every[k], tree.above.get(k)
         if above is None or above.parent < 0:
+            roots[k] = name
             robots[k] = XML("robot", name=name), out if single else out.with_name(f"{out.stem}.{name}.urdf")
             if above is not None:
                 add(robots[k][0], "link", name="world")
@@ -967,8 +969,11 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     if single:
         return [*files, *assets], []
     poses = out.with_suffix(".csv")
-    start = replace(take, time=take.time[:1], position=take.position[:1], quat_xyzw=take.quat_xyzw[:1])
-    _csv(start, poses, on_progress)
+    position, quat = take.position[:1].copy(), take.quat_xyzw[:1].copy()
+    held = [k for k in roots if k in tree.above]  # by a joint in the world, which is the first link of their files
+    position[:, held], quat[:, held] = 0.0, (0.0, 0.0, 0.0, 1.0)
+    start = replace(take, time=take.time[:1], position=position, quat_xyzw=quat)
+    _write_poses(start, poses, roots)
     left_out = ["the poses of bodies: they are in the CSV", "gravity, velocities and collides_with", *_missing(take)]
     left_out += jointed.urdf_left_out(take.scene, tree)
     return [*files, poses, *assets], left_out
@@ -990,15 +995,20 @@ def _urdf_form(geometry: XML, form: Any, scale: float) -> None:
 
 
 def _csv(take: Take, out: Path, on_progress: StageProgress) -> Written:
+    _write_poses(take, out, {k: body.name for k, body in enumerate(take.scene.bodies)})
+    return [out], ["everything but poses"]
+
+
+def _write_poses(take: Take, out: Path, names: dict[int, str]) -> None:
+    """The poses of the bodies that have a name here."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for t, time in enumerate(take.time):
-        for k, body in enumerate(take.scene.bodies):
+        for k, name in names.items():
             pose = np.concatenate([take.position[t, k], take.quat_xyzw[t, k]])
-            writer.writerow([f"{time:.9g}", body.name, *(f"{value:.12g}" for value in pose)])
+            writer.writerow([f"{time:.9g}", name, *(f"{value:.12g}" for value in pose)])
     write_text(out, text.getvalue())
-    return [out], ["everything but poses"]
 
 
 # --- a page ---

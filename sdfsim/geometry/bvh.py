@@ -10,7 +10,7 @@ from sdfsim.geometry.mesh import Mesh, area_vectors
 # A single ray meets edges and vertices of plain cubes; five randomly directed ones outvote that.
 PARITY_RAYS = 5
 GEOMETRIES = 1024
-DIRECTIONS = np.random.default_rng(0).standard_normal((3, 3))
+DIRECTIONS = np.random.default_rng(0).standard_normal((2, 3))
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 

@@ -959,7 +959,8 @@ def _allowed(schema: dict) -> str:
         limit = schema.get(native, schema.get(other, np.inf))
         limits += [f"{sign} {limit:g}"] if abs(limit) < LARGEST else []
     if "maxItems" in schema:
-        return ", each ".join(part for part in (f"{schema['maxItems']} numbers", _allowed(schema["items"])) if part)
+        items = "names" if schema["items"].get("type") == "string" else "numbers"
+        return ", each ".join(part for part in (f"{schema['maxItems']} {items}", _allowed(schema["items"])) if part)
     return ", ".join(schema.get("enum", [])) or " and ".join(limits)
 
 

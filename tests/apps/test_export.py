@@ -485,9 +485,10 @@ def test_pybullet_rests_where_we_do(dropped):
     try:
         engine.setGravity(*dropped.scene.gravity)
         found = {}
-        for row in csv.DictReader(out.with_suffix(".csv").open()):
-            name = row["body"]
+        rows = {row["body"]: row for row in csv.DictReader(out.with_suffix(".csv").open())}
+        for name in [body.name for body in dropped.scene.bodies]:
             plain = "_1_box" if name == "1 box" else name.replace(" ", "_")
+            row = rows.pop(plain)
             place, turn = [float(row[c]) for c in "xyz"], [float(row[f"q{c}"]) for c in "xyzw"]
             flags = engine.URDF_USE_INERTIA_FROM_FILE
             found[name] = engine.loadURDF(str(out.with_name(f"scene.{plain}.urdf")), place, turn, flags=flags)
@@ -502,8 +503,45 @@ def test_pybullet_rests_where_we_do(dropped):
         for name in RESTING:
             there = np.array(engine.getBasePositionAndOrientation(found[name])[0])
             assert_rests(there, dropped.centre(name), name)
+        assert not rows
     finally:
         engine.disconnect()
+
+
+def test_the_csv_beside_urdf_files_places_each_of_them_also_trees_that_hang_in_the_world(tmp_path):
+    """Every file is loaded where its row says, and every link is then where its body starts."""
+    import pybullet as engine
+
+    file = tmp_path / "scene.yaml"
+    file.write_text("""
+version: 1
+shapes:
+  arm: {box: {size: [0.4, 0.1, 0.1]}}
+  hand: {box: {size: [0.2, 0.1, 0.1]}}
+  ball: {sphere: {radius: 0.1}}
+bodies:
+  - {name: arm, shape: arm, position: [0.7, 0, 1], euler_xyz_deg: [0, 0, 30], mass: 1}
+  - {name: hand, shape: hand, position: [1.2, 0, 1], euler_xyz_deg: [0, 0, 30], mass: 1}
+  - {name: "a ball[3]", shape: ball, position: [0, 2, 3], euler_xyz_deg: [0, 40, 0], mass: 1}
+joints:
+  - {name: shoulder, type: hinge, bodies: [arm, world], anchor: [0.5, 0, 1], axis: [0, 0, 1]}
+  - {name: wrist, type: hinge, bodies: [hand, arm], anchor: [1, 0, 1], axis: [0, 0, 1]}
+""")
+    export(file, out := tmp_path / "new" / "scene.urdf")
+    engine.connect(engine.DIRECT)
+    try:
+        places = {}
+        for row in csv.DictReader(out.with_suffix(".csv").open()):
+            place, turn = [float(row[c]) for c in "xyz"], [float(row[f"q{c}"]) for c in "xyzw"]
+            body = engine.loadURDF(str(out.with_name(f"scene.{row['body']}.urdf")), place, turn)
+            places[row["body"]] = engine.getBasePositionAndOrientation(body)[0]
+            for joint in range(engine.getNumJoints(body)):
+                places[engine.getJointInfo(body, joint)[12].decode()] = engine.getLinkState(body, joint)[0]
+    finally:
+        engine.disconnect()
+    assert len(list(out.parent.glob("scene.*.urdf"))) == 2
+    for name, there in (("arm", (0.7, 0, 1)), ("hand", (1.2, 0, 1)), ("a_ball_3", (0, 2, 3))):
+        np.testing.assert_allclose(places[name], there, atol=1e-6)
 
 
 def test_mujoco_starts_with_the_velocity_of_the_centre_of_mass(tmp_path):
