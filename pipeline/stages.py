@@ -165,7 +165,7 @@ class Stage:
 
 STAGES = {
     "photos": Stage(do_photos, "photos", version=5),
-    "poses": Stage(do_poses, "poses", version=10),
+    "poses": Stage(do_poses, "poses", version=11),
     "distill": Stage(do_distill, "distill", version=15),
     "mesh": Stage(do_mesh, "mesh", version=22),
     "fit": Stage(do_fit, "assets", version=4),
