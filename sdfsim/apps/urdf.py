@@ -427,6 +427,9 @@ class _Reader:
         for key in ("damping", "friction"):
             value = 0.0 if dynamics is None else self.number(dynamics, key, 0.0, least=0.0)
             others |= {key: value} if value else {}
+        if others and kind in ("fixed", "floating"):
+            self.left[f"<dynamics> of {kind} joints"] += 1
+            others = {}
         held = {"name": name, "child": child, "parent": parent, "anchor": anchor}
         if kind == "floating":
             return replace(links[child], pose=pose), []

@@ -948,3 +948,13 @@ def test_xacro_is_expanded_if_it_is_installed(tmp_path: Path) -> None:
         scene, report = imported(file, fixed=True)
         assert {joint.name: joint.start for joint in scene.joints}["shoulder"] == pytest.approx(0.2)
         assert any("xacro" in line for line in report["notes"])
+
+
+def test_a_fixed_joint_whose_file_gives_it_damping_holds_all_the_same(tmp_path):
+    """As Baxter's hands have it: a link with mass and shape on a fixed joint with <dynamics>."""
+    text = ARM.replace('name="spin" type="continuous"', 'name="spin" type="fixed"')
+    text = text.replace('<axis xyz="0 0 -2"/></joint>', '<axis xyz="0 0 -2"/><dynamics damping="0.7"/></joint>')
+    plain, _ = imported(write(tmp_path / "plain", "arm.urdf", text.replace('<dynamics damping="0.7"/>', "")))
+    scene, report = imported(write(tmp_path / "damped", "arm.urdf", text))
+    assert [joint.kind for joint in scene.joints] == [joint.kind for joint in plain.joints]
+    assert "<dynamics> of fixed joints (1)" in report["left_out"]
