@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.bvh import ClosestPoint, Crossings, Winding
+from sdfsim.geometry.bvh import Around, ClosestPoint, Winding
 from sdfsim.geometry.mass import integrals
 from sdfsim.geometry.mesh import (
     Frame,
@@ -98,18 +98,10 @@ def solidify(mesh: Mesh, *, name: str = "mesh", cap: bool = False, thicken: floa
         vertices, faces = _close(vertices, faces, np.inf, area, frame.scale, notes)
         faces = _outwards(vertices, *consistent(vertices, faces))
     closed = is_closed(_plain(vertices, faces))
-    winding = Winding(_plain(vertices, faces))
     if not closed:
-        _require_tight(vertices, faces, winding, frame.scale, name)
+        _require_tight(vertices, faces, frame.scale, name)
 
-    rays = Crossings(_plain(vertices, faces))
-
-    def around(points: np.ndarray) -> np.ndarray:
-        """Winding numbers [P]: by two rays if these agree, as nearly everywhere, else exactly."""
-        value = rays(points, 0)
-        doubt = rays(points, 1) != value
-        value[doubt] = winding(points[doubt])
-        return value
+    around = Around(_plain(vertices, faces))
 
     def side(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
         within, without = around(points - STEP * normals), around(points + STEP * normals)
@@ -221,8 +213,9 @@ def _close(
     return np.concatenate(points), np.concatenate(added)
 
 
-def _require_tight(vertices: np.ndarray, faces: np.ndarray, winding: Winding, scale: float, name: str) -> None:
+def _require_tight(vertices: np.ndarray, faces: np.ndarray, scale: float, name: str) -> None:
     """Raise SdfsimError if the surface has openings that are too large to count as closed."""
+    winding = Winding(_plain(vertices, faces))
     probes = no_longer_than(vertices[faces], 0.05)
     centres, normals = centres_and_normals(probes)
     weights = face_areas(probes)

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.bvh import ClosestPoint, Winding
+from sdfsim.geometry.bvh import Around, ClosestPoint, Winding
 from sdfsim.geometry.mesh import Mesh, components, is_closed, joined
 from sdfsim.geometry.solidify import Solid, exposed
 
@@ -62,7 +62,7 @@ class MeshDistance:
         self.bounds = np.stack([self.surface.vertices.min(0), self.surface.vertices.max(0)])
         # Distances to a thickened sheet are measured from the sheet.
         self._nearest = ClosestPoint(body.body if body.thickness else body.surface)
-        self._winding = Winding(body.body)
+        self._winding = Around(body.body) if body.closed else Winding(body.body)
 
     def __call__(self, points: np.ndarray) -> Reference:
         """Reference values at `points` [P, 3] m."""
