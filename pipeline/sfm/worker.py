@@ -91,14 +91,14 @@ def features_of(job: dict, name: str) -> tuple[np.ndarray, np.ndarray]:
     orientation (rad) [F, 4] float32, and RootSIFT descriptors [F, 128] uint8 (Arandjelovic and Zisserman 2012)."""
     import cv2
 
-    grey = cv2.imread(str(Path(job["images"]) / name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    mask = cv2.imread(str(Path(job["masks"]) / f"{name}.png"), cv2.IMREAD_GRAYSCALE) if job["masks"] else None
+    grey: Any = cv2.imread(str(Path(job["images"]) / name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    mask: Any = cv2.imread(str(Path(job["masks"]) / f"{name}.png"), cv2.IMREAD_GRAYSCALE) if job["masks"] else None
     ratio = min(1.0, job["pixels"] / max(grey.shape))
     if ratio < 1:
         grey = cv2.resize(grey, None, fx=ratio, fy=ratio, interpolation=cv2.INTER_AREA)
     if mask is not None:
         mask = cv2.resize(mask, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
-    sift = cv2.SIFT.create(contrastThreshold=job["contrast"], enable_precise_upscale=True)
+    sift: Any = cv2.SIFT.create(contrastThreshold=job["contrast"], enable_precise_upscale=True)
     found = sorted(sift.detect(grey, mask), key=lambda key: -key.size)[: job["features"]]
     found, words = sift.compute(grey, found)
     if not found:
