@@ -619,8 +619,7 @@ def scenery(surface: FieldSurface, bodies: list[FoundBody], distance: Distance,
     assert raw.colors is not None
     # Away from cuts, the vertices are those of the whole surface, and take its attributes.
     away, nearest = KDTree(raw.vertices).query(mesh.vertices, distance_upper_bound=1e-6)
-    same = np.isfinite(away)
-    nearest[~same] = 0
+    same, nearest = np.isfinite(away), np.minimum(nearest, len(raw.vertices) - 1)
     shown = same & _at_faces(raw, surface.shown)[nearest]
     color = raw.colors[nearest].astype(float)
     color[~same] = spread_colors(mesh.vertices[~same], mesh.vertices[shown], color[shown])
