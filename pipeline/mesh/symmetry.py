@@ -94,6 +94,8 @@ class Known:
         """The same, to be sampled at places twice as far apart, in an eighth of the time."""
         other = copy(self)
         other.finer = 2 * self.finer
+        for samples in ("volume", "trust"):
+            vars(other).pop(samples, None)
         return other
 
     @cached_property

@@ -82,7 +82,8 @@ def features(pycolmap, job: dict, database: Path) -> None:
             if not opened.exists_descriptors(image.image_id):
                 keypoints, descriptors = features_of(job, image.name)
                 sift = pycolmap.FeatureExtractorType.SIFT
-                opened.write_keypoints(image.image_id, keypoints)
+                if not opened.exists_keypoints(image.image_id):  # A killed run may have written these only.
+                    opened.write_keypoints(image.image_id, keypoints)
                 opened.write_descriptors(image.image_id, pycolmap.FeatureDescriptors(sift, descriptors))
 
 

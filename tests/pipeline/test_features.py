@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -78,3 +80,15 @@ def test_no_feature_lies_outside_a_mask(tmp_path):
     (none, _), (half, words) = found_in(tmp_path, 10**6, masks=str(tmp_path / "masks"))
     assert len(none) == 0 and len(half) == len(words) > 30
     assert half[:, 0].min() > WIDE / 2 - 1
+
+
+def test_a_run_that_was_killed_between_places_and_descriptors_goes_on(tmp_path):
+    for number in (0, 1):
+        noise(24 + number).save(tmp_path / f"{number}.jpg")
+    whole = found_in(tmp_path, 90)
+    with closing(sqlite3.connect(tmp_path / "90.db")) as opened:
+        opened.execute("DELETE FROM descriptors WHERE image_id = 2")
+        opened.commit()
+    for values, wanted in zip(found_in(tmp_path, 90), whole, strict=True):
+        for one, other in zip(values, wanted, strict=True):
+            np.testing.assert_array_equal(one, other)
