@@ -182,6 +182,11 @@ def revolve(profile: np.ndarray, segments: int) -> Mesh:
     return _tube(rings, len(profile) - 1)
 
 
+def ring(profile: np.ndarray, segments: int) -> Mesh:
+    """The solid of a closed profile [K, 2] of (radius, z), counter-clockwise, turned about z."""
+    return _tube(np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments]))
+
+
 def _tube(rings: np.ndarray, strips: int | None = None) -> Mesh:
     """The tube through rings [R, K, 3], the last joined to the first, with K strips around it, or only the first
     `strips`."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from math import cos, pi, radians, sqrt, tan
+from math import cos, pi, radians, sin, sqrt, tan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +14,7 @@ from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Setting, about, fixed, floor, run, run_built, solid
 from sdfsim.geometry.mesh import Mesh, clean, joined
 from sdfsim.geometry.mesh_io import write_ply
-from sdfsim.geometry.primitives import box, revolve, sleeve, tube
+from sdfsim.geometry.primitives import box, cylinder, revolve, ring, sleeve, tube
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.shape.make import mesh_shape
 from sdfsim.shape.shape import Shape
@@ -94,38 +94,74 @@ def rollers(at: Setting) -> Iterator[Check]:
     yield Check(f"{ran.label}: keeps", ran.v("disc")[-1, 0] / 0.4, 0.93, 1.001, "of its speed")
 
 
-def spur_gear(teeth: int, module: float, height: float = 0.02) -> Mesh:
-    """A gear about z with involute flanks at 20 degrees and a hundredth of its module of backlash, its first tooth at
-    +x. Lengths in m."""
+def outline(teeth: int, module: float, tip: float = 1.0, root: float = 1.25, wider: float = -0.01) -> np.ndarray:
+    """A gear about z as corners [K, 2], its first tooth at +x: involute flanks at 20 degrees, teeth from `root` below
+    the pitch circle to `tip` above it, and half a tooth `wider` than half the pitch. Lengths in modules of `module`
+    m."""
     pitch, press = 0.5 * module * teeth, radians(20.0)
-    root, base = pitch - 1.25 * module, pitch * cos(press)
-    half = pi / (2 * teeth) + tan(press) - press - 0.01 * module / pitch  # of a tooth at the base circle
-    radius = np.linspace(max(base, root), pitch + module, 8)
+    low, base = pitch - root * module, pitch * cos(press)
+    half = pi / (2 * teeth) + tan(press) - press + wider * module / pitch  # of a tooth at the base circle
+    radius = np.linspace(max(base, low), pitch + tip * module, 8)
     angle = np.arccos(base / radius)
     off = half - (np.tan(angle) - angle)
-    if root < base:
-        radius, off = np.append(root, radius), np.append(half, off)
+    if low < base:
+        radius, off = np.append(low, radius), np.append(half, off)
     radius, off = np.append(radius, radius[::-1]), np.append(-off, off[::-1])
     turn = (2 * pi / teeth * np.arange(teeth)[:, None] + off).reshape(-1)
-    circle = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return sleeve(np.tile(radius, teeth)[:, None] * circle, 2 * module * circle, height)
+    return np.tile(radius, teeth)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+def spur_gear(teeth: int, module: float, height: float) -> Mesh:
+    """A gear with a bore and a hundredth of its module of backlash, m."""
+    rim = outline(teeth, module)
+    return sleeve(rim, 2 * module * rim / np.linalg.norm(rim, axis=1, keepdims=True), height)
+
+
+def ring_gear(teeth: int, module: float, height: float) -> Mesh:
+    """A ring with teeth inside, low enough not to meet what is below the involutes of small gears."""
+    rim = outline(teeth, module, tip=1.25, root=0.75, wider=0.01)
+    return sleeve((0.5 * teeth + 4) * module * rim / np.linalg.norm(rim, axis=1, keepdims=True), rim, height)
+
+
+class Files:
+    """Meshes as files, until the scene is read."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = Path(folder)
+
+    def __call__(self, name: str, mesh: Mesh) -> str:
+        path = self.folder / f"{name}.ply"
+        path.write_bytes(write_ply(mesh))
+        return str(path)
 
 
 def gears(at: Setting) -> Iterator[Check]:
-    """Two spur gears of 20 and 40 teeth of 5 mm: ten turns, without a tooth that is skipped."""
-    built = SceneBuilder(gravity=(0, 0, 0))
+    """Two spur gears of 20 and 40 teeth of 5 mm, and a planet set of 18, 18 and 54 teeth of 2 mm: ten turns, without a
+    tooth that is skipped."""
+    built, planets, spins = SceneBuilder(gravity=(0, 0, 0)), SceneBuilder(gravity=(0, 0, 0)), {"axis": (0, 0, 1)}
     with TemporaryDirectory() as folder:
+        mesh = Files(folder)
         for name, teeth, place, turn in (("small", 20, 0.0, 0.0), ("large", 40, 0.15, 180 + 180 / 40)):
-            path = Path(folder) / f"{name}.ply"
-            path.write_bytes(write_ply(spur_gear(teeth, 5e-3)))
-            built.add(name, mesh=str(path), position=(place, 0, 0), mass=0.1, euler_xyz_deg=(0, 0, turn))
-        driven: dict[str, Any] = {"axis": (0, 0, 1), "anchor": (0, 0, 0), "motor": {"speed": 2 * pi, "max_force": 10}}
-        built.join("driven", "hinge", "small", **driven)
-        built.join("follows", "hinge", "large", axis=(0, 0, 1), anchor=(0.15, 0, 0), damping=0.01)
-        ran = run_built(at, "spur gears", built, 10.0)
-    turns = ran.rollout.joint_position[-1] / (2 * pi)
-    yield ran.near("turns", turns[0], 10.0, 1e-2)
-    yield ran.near("ratio", turns[0] / turns[1], -2.0, 1e-3)
+            gear = mesh(name, spur_gear(teeth, 5e-3, 0.02))
+            built.add(name, mesh=gear, position=(place, 0, 0), mass=0.1, euler_xyz_deg=(0, 0, turn))
+        built.join("driven", "hinge", "small", anchor=(0, 0, 0), motor={"speed": 2 * pi, "max_force": 10}, **spins)
+        built.join("follows", "hinge", "large", anchor=(0.15, 0, 0), damping=0.01, **spins)
+        pair = run_built(at, "spur gears", built, 10.0)
+        gear, ring = mesh("gear", spur_gear(18, 2e-3, 0.01)), mesh("ring", ring_gear(54, 2e-3, 0.01))
+        planets.add("ring", mesh=ring, motion="static", euler_xyz_deg=(0, 0, 180 / 54))
+        planets.add("sun", mesh=gear, mass=0.05)
+        planets.join("driven", "hinge", "sun", anchor=(0, 0, 0), motor={"speed": 20 * pi, "max_force": 10}, **spins)
+        planets.add("carrier", box={"size": [0.04, 0.04, 2e-3]}, position=(0, 0, 0.03), mass=0.05, collides_with=[])
+        planets.join("follows", "hinge", "carrier", anchor=(0, 0, 0), damping=0.01, **spins)
+        for k in range(3):
+            place, turn = 0.036 * np.array([cos(2 * pi * k / 3), sin(2 * pi * k / 3), 0]), 120 * k + 190
+            planets.add(f"planet{k}", mesh=gear, position=place, mass=0.05, euler_xyz_deg=(0, 0, turn))
+            planets.join(f"axle{k}", "hinge", f"planet{k}", "carrier", anchor=place, **spins)
+        orbits = run_built(at, "planet set", planets, 1.0)
+    for ran, least, ratio in ((pair, 9.9, -2.0), (orbits, 9.0, 1 + 54 / 18)):
+        turns = ran.rollout.joint_position[-1] / (2 * pi)
+        yield ran.between("turns", turns[0], least, 10.1, "")
+        yield ran.near("ratio", turns[0] / turns[1], ratio, 1e-3)
 
 
 def threaded(flanks: np.ndarray, pitch: float, turns: int, other: float, around: int = 96) -> Mesh:
@@ -156,13 +192,14 @@ def threaded(flanks: np.ndarray, pitch: float, turns: int, other: float, around:
 
 
 def nuts(at: Setting) -> Iterator[Check]:
-    """An M16 nut with a tenth of a millimetre of play on its bolt, both of 96 facets: friction locks it, and without
-    friction it turns down by the lead, somewhat slower than on a true screw, as each facet is an impact."""
+    """An M16 nut with a tenth of a millimetre of play on its bolt, both of 96 facets: friction locks it, a motor drives
+    it by its pitch a turn, and without friction it turns down by the lead, somewhat slower than on a true screw, as
+    each facet is an impact."""
     pitch, radius = 2e-3, 8e-3
     root = radius - 5 / 8 * pitch * sqrt(0.75)
     flanks = np.array([(0.0, radius), (1 / 8, radius), (7 / 16, root), (11 / 16, root)])
-    bolt = mesh_shape(threaded(flanks, pitch, 14, 0.0), name="bolt", kind="mesh")
-    nut = mesh_shape(threaded(flanks + np.array([0.0, 1e-4]), pitch, 5, 12e-3), name="nut", kind="mesh")
+    screw, female = threaded(flanks, pitch, 14, 0.0), threaded(flanks + np.array([0.0, 1e-4]), pitch, 5, 12e-3)
+    bolt, nut = (mesh_shape(mesh, name=name, kind="mesh") for mesh, name in ((screw, "bolt"), (female, "nut")))
     lead, spin = pitch / (2 * pi), nut.inertia[2, 2] / nut.volume
     for mu in (0.2, 0.0):
         scale = 1 / at.size
@@ -176,6 +213,76 @@ def nuts(at: Setting) -> Iterator[Check]:
             yield ran.near("down a turn", 2 * pi * way / -turned, pitch, 0.02, "m")
             full = G * lead / (lead**2 + spin) * ran.time[-1]
             yield ran.between("speed of a true screw", -spins[-1] / full, 0.75, 1.01, "")
+    built, start = SceneBuilder(), (0, 0, 6 * pitch)
+    with TemporaryDirectory() as folder:
+        mesh = Files(folder)
+        built.add("bolt", mesh=mesh("bolt", screw), motion="static")
+        built.add("nut", mesh=mesh("nut", female), position=start, mass=0.02, friction=0.2)
+        built.add("driver", box={"size": [5e-3, 5e-3, 5e-3]}, position=(0, 0, 0.05), mass=0.02, collides_with=[])
+        built.join("up", "slider", "driver", axis=(0, 0, 1))
+        built.join("drive", "hinge", "nut", "driver", axis=(0, 0, 1), anchor=start,
+                   motor={"speed": 4 * pi, "max_force": 1.0})  # fmt: skip
+        ran = run_built(at, "driven", built, 1.0)
+    quarter = len(ran.time) // 4
+    way, turned = np.ptp(ran.rollout.position[quarter:, 1, 2]), np.ptp(ran.rollout.joint_position[quarter:, 1])
+    yield ran.near("up a turn", 2 * pi * way / turned, pitch, 0.01, "m")
+    yield ran.between("turns", turned / (2 * pi), 1.4, 1.6, "")
 
 
-ASSEMBLY = (pegs, rims, rollers, gears, nuts)
+def bearings(at: Setting) -> Iterator[Check]:
+    """Eight balls in the grooves of a ring that turns under its weight, in one that is held: they orbit at the rate at
+    which they roll, and friction takes little of the spin."""
+    middle, ball, groove, play = 20e-3, 3e-3, 3.12e-3, 1e-5  # m: the radius of the orbit; radii; on each side
+    built = SceneBuilder()
+    with TemporaryDirectory() as folder:
+        mesh = Files(folder)
+        for name, side in (("outer", 1), ("inner", -1)):
+            centre, edge = middle + side * (ball + play - groove), middle + side * 0.6 * ball
+            half = np.arccos(side * (edge - centre) / groove)
+            turn = np.linspace(-half, half, 24)
+            arc = np.column_stack([centre + side * groove * np.cos(turn), groove * np.sin(turn)])
+            back = middle + side * 2 * ball
+            profile = np.array([(back, -5e-3), (edge, -5e-3), *arc, (edge, 5e-3), (back, 5e-3)])[::side]
+            motion: dict[str, Any] = {"motion": "static"} if side > 0 else {"mass": 2.0, "angular_velocity": (0, 0, 20)}
+            built.add(name, mesh=mesh(name, ring(profile, 192)), friction=1.0, restitution=0, **motion)
+        for k in range(8):
+            place = middle * np.array([cos(pi * k / 4), sin(pi * k / 4), 0])
+            built.add(f"ball{k}", sphere={"radius": ball}, position=place, mass=1e-3, friction=0.3, restitution=0)
+        ran = run_built(at, "ball bearing", built, 0.6)
+    places, half = ran.rollout.position[:, 2:], len(ran.time) // 2
+    angle = np.unwrap(np.arctan2(places[..., 1], places[..., 0]), axis=0)
+    spins, seconds = ran.rollout.angular_velocity[:, 1, 2], ran.time[-1] - ran.time[half]
+    lean = 1 - play / (groove - ball)  # cosine of the angle at which the grooves meet the balls
+    orbit = (angle[-1] - angle[half]).mean() / seconds
+    yield ran.near("orbits for a turn", orbit / spins[half:].mean(), 0.5 * (1 - ball / middle * lean), 0.02)
+    yield ran.between("spin kept", spins[-1] / spins[0], 0.8, 1.001, "")
+    yield from ran.laws()
+
+
+def bricks(at: Setting) -> Iterator[Check]:
+    """Two toy bricks of a given stiffness, pressed together: their studs are a tenth of a millimetre too wide, which
+    friction turns into a hold of 1.25 N."""
+    wall, high, studs, over, stiffness = 1.5e-3, 9.6e-3, 4e-3, 1e-4, 5e4  # m; N/m
+    size, parts = 16e-3, []
+    for extent, place in (
+        ((size, size, wall), (0, 0, high - wall / 2)),
+        *(((wall, size, high - wall), (s * (size - wall) / 2, 0, (high - wall) / 2)) for s in (-1, 1)),
+        *(((size, wall, high - wall), (0, s * (size - wall) / 2, (high - wall) / 2)) for s in (-1, 1)),
+    ):
+        parts.append(Mesh(box(extent).vertices + np.array(place), box(extent).faces))
+    stud = cylinder(size / 2 - wall - studs + over, 2.8e-3, 48)
+    for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        parts.append(Mesh(stud.vertices + np.array([x * studs, y * studs, high + 4e-4]), stud.faces))
+    for weight, holds in ((1.0, True), (10.0, False)):
+        built = SceneBuilder()
+        with TemporaryDirectory() as folder:
+            brick = Files(folder)("brick", joined(parts))
+            built.add("upper", mesh=brick, position=(0, 0, high + 1e-5), motion="static")
+            built.add("lower", mesh=brick, mass=weight / G, stiffness=stiffness, damping=5.0)
+            ran = run_built(at, f"{weight:g} N", built, 0.3)
+        fallen = -float(np.ptp(ran.rollout.position[:, 1, 2]))
+        wanted = (-1e-5, 0.0) if holds else (-np.inf, -0.1)
+        yield ran.between("moves", fallen, *wanted, "m")
+
+
+ASSEMBLY = (pegs, rims, rollers, gears, nuts, bearings, bricks)
