@@ -215,7 +215,7 @@ def test_the_table_counts_and_names_what_is_missed_or_absent():
         ("slabs", OURS): {"failed": "no memory"},
         ("slabs", "PyBullet"): found(["y"], []),
     }
-    (_, *rows), notes = table(results)
+    (_, *rows), notes = table(results, GROUPS["everyday"])
     others = ("not installed here",) * (len(ENGINES) - 2)
     assert rows == [
         ("`slabs`", "no memory", "1 / 1", *others), ("`edges`", "1 / 2", "2 / 2, 2 not run", *others),

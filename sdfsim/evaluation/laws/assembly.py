@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Setting, about, fixed, floor, run, run_built, solid
+from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Ran, Setting, about, fixed, floor, run, run_built, solid
 from sdfsim.geometry.mesh import Mesh, clean, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box, cylinder, revolve, ring, sleeve, tube
@@ -135,6 +135,11 @@ class Files:
         return str(path)
 
 
+def spun(ran: Ran, name: str) -> np.ndarray:
+    """[T+1] rad by which a body has turned about z, of which a frame has less than half a turn."""
+    return np.unwrap(ran.turn(name).as_euler("ZYX")[:, 0])
+
+
 def gears(at: Setting) -> Iterator[Check]:
     """Two spur gears of 20 and 40 teeth of 5 mm, and a planet set of 18, 18 and 54 teeth of 2 mm: ten turns, without a
     tooth that is skipped."""
@@ -158,10 +163,10 @@ def gears(at: Setting) -> Iterator[Check]:
             planets.add(f"planet{k}", mesh=gear, position=place, mass=0.05, euler_xyz_deg=(0, 0, turn))
             planets.join(f"axle{k}", "hinge", f"planet{k}", "carrier", anchor=place, **spins)
         orbits = run_built(at, "planet set", planets, 1.0)
-    for ran, least, ratio in ((pair, 9.9, -2.0), (orbits, 9.0, 1 + 54 / 18)):
-        turns = ran.rollout.joint_position[-1] / (2 * pi)
-        yield ran.between("turns", turns[0], least, 10.1, "")
-        yield ran.near("ratio", turns[0] / turns[1], ratio, 1e-3)
+    for ran, least, names, ratio in ((pair, 9.9, ("small", "large"), -2.0), (orbits, 9.0, ("sun", "carrier"), 4.0)):
+        first, second = (spun(ran, name)[-1] / (2 * pi) for name in names)
+        yield ran.between("turns", first, least, 10.1, "")
+        yield ran.near("ratio", first / second, ratio, 1e-3)
 
 
 def threaded(flanks: np.ndarray, pitch: float, turns: int, other: float, around: int = 96) -> Mesh:
@@ -224,7 +229,7 @@ def nuts(at: Setting) -> Iterator[Check]:
                    motor={"speed": 4 * pi, "max_force": 1.0})  # fmt: skip
         ran = run_built(at, "driven", built, 1.0)
     quarter = len(ran.time) // 4
-    way, turned = np.ptp(ran.rollout.position[quarter:, 1, 2]), np.ptp(ran.rollout.joint_position[quarter:, 1])
+    way, turned = np.ptp(ran.rollout.position[quarter:, 1, 2]), np.ptp(spun(ran, "nut")[quarter:])
     yield ran.near("up a turn", 2 * pi * way / turned, pitch, 0.01, "m")
     yield ran.between("turns", turned / (2 * pi), 1.4, 1.6, "")
 
