@@ -15,6 +15,7 @@ from benchmarks import everyday as bench
 from benchmarks.engines import mujoco
 from benchmarks.everyday import (
     ENGINES,
+    GROUPS,
     OURS,
     NotRun,
     counted,
@@ -216,7 +217,7 @@ def test_the_table_counts_and_names_what_is_missed_or_absent():
         ("slabs", "PyBullet"): found(["y"], []),
     }
     (_, *rows), notes = table(results, GROUPS["everyday"])
-    others = ("not installed here",) * (len(ENGINES) - 2)
+    others = ("not installed here",) * (len(GROUPS["everyday"]) - 2)
     assert rows == [
         ("`slabs`", "no memory", "1 / 1", *others), ("`edges`", "1 / 2", "2 / 2, 2 not run", *others),
         ("all", "1 / 2", "3 / 3, 2 not run", *others),
