@@ -22,6 +22,7 @@ from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
 STEEPEST = -0.1  # cosine below which they face each other
 LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall
+OPEN = -1.0  # in place of 0 or 1: whether a contact is void is not known yet
 AROUND = 12.0  # slops: distance from a contact within which triangles may be its wall
 
 
@@ -61,13 +62,22 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
     pieces = max(1, shapes.solids.start[t + 1] - shapes.solids.start[t])
     if pair_kind(shapes, s, t) != SOLIDS:
         for k in range(manifolds.count[p]):
-            manifolds.point[p, k, VOID] = 0.0
+            manifolds.point[p, k, VOID] = OPEN
+        # The deepest contact last: of two that would void each other it stays.
+        for _ in range(manifolds.count[p]):
+            last = -1
+            for k in range(manifolds.count[p]):
+                if manifolds.point[p, k, VOID] == OPEN and (
+                    last < 0 or manifolds.point[p, k, GAP] > manifolds.point[p, last, GAP]
+                ):
+                    last = k
+            manifolds.point[p, last, VOID] = 0.0
             for side in range(2):
                 if not world.moves[manifolds.pair[p, side]]:
                     continue
-                found, _ = _support(shapes, world, work, motion, rules, manifolds, near, p, k, side)
+                found, _ = _support(shapes, world, work, motion, rules, manifolds, near, p, last, side)
                 if found:
-                    manifolds.point[p, k, VOID] = 1.0
+                    manifolds.point[p, last, VOID] = 1.0
         return
     if shapes.table[t, KIND] == PLANE:
         return
@@ -113,7 +123,9 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
                 continue
             m = _normal(manifolds, q, e, own)
             facing = dot(n, m)
-            if facing > ASLANT or facing < STEEPEST or manifolds.point[q, e, GAP] > rules.slop:
+            # What supports nothing itself is no support: else contacts void each other, and bodies fall through.
+            void = manifolds.point[q, e, VOID] > 0.0
+            if void or facing > ASLANT or facing < STEEPEST or manifolds.point[q, e, GAP] > rules.slop:
                 continue
             # The plane of the support, and how far the other body's piece extends above it.
             ground = manifolds.pair[q, 1 - own]
