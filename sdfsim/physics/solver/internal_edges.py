@@ -21,7 +21,7 @@ from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
 STEEPEST = -0.1  # cosine below which they face each other
-LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall
+LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall, nor what is deeper
 OPEN = -1.0  # in place of 0 or 1: whether a contact is void is not known yet
 AROUND = 12.0  # slops: distance from a contact within which triangles may be its wall
 
@@ -73,7 +73,7 @@ def _heed(shapes, world, work, motion, rules, manifolds, near, scratch, p):
                     last = k
             manifolds.point[p, last, VOID] = 0.0
             for side in range(2):
-                if not world.moves[manifolds.pair[p, side]]:
+                if not world.moves[manifolds.pair[p, side]] or manifolds.point[p, last, GAP] < -LEVEL * rules.slop:
                     continue
                 found, _ = _support(shapes, world, work, motion, rules, manifolds, near, p, last, side)
                 if found:
