@@ -136,8 +136,9 @@ class Files:
 
 
 def spun(ran: Ran, name: str) -> np.ndarray:
-    """[T+1] rad by which a body has turned about z, of which a frame has less than half a turn."""
-    return np.unwrap(ran.turn(name).as_euler("ZYX")[:, 0])
+    """[T+1] rad by which a body has turned about z, less than half a turn in a frame."""
+    turned = np.unwrap(ran.turn(name).as_euler("ZYX")[:, 0])
+    return turned - turned[0]
 
 
 def gears(at: Setting) -> Iterator[Check]:
