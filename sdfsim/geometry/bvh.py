@@ -87,13 +87,12 @@ class Crossings(_Centred):
         super().__init__(mesh)
         # Open3D reports one of two hits at the same distance, unless these are on different geometries. So faces are
         # spread over many geometries, and faces that lie on each other are both hit.
-        order = np.random.default_rng(0).permutation(len(mesh.faces))
-        groups = np.array_split(order, min(GEOMETRIES, len(order)))
+        corners = mesh.vertices[mesh.faces[np.random.default_rng(0).permutation(len(mesh.faces))]]
+        groups = np.array_split(corners, min(GEOMETRIES, len(corners)))
         for group in groups:
-            used, faces = np.unique(mesh.faces[group], return_inverse=True)
-            self._add(mesh.vertices[used], faces.reshape(-1, 3))
+            self._add(group.reshape(-1, 3), np.arange(3 * len(group)).reshape(-1, 3))
         self._start = np.cumsum([0, *(len(group) for group in groups)])
-        self._senses = np.sign(area_vectors(mesh.vertices[mesh.faces[order]]) @ DIRECTIONS.T)  # [F, D]
+        self._senses = np.sign(area_vectors(corners) @ DIRECTIONS.T)  # [F, D]
 
     def __call__(self, points: np.ndarray, direction: int) -> np.ndarray:
         """[P] float64 at `points` [P, 3] m, by rays in one of `DIRECTIONS`."""
