@@ -14,12 +14,13 @@ from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.scene import Body, Scene
 
 WITHIN = 0.05  # m of the goal: success
+APART = 0.01  # m between a body's free places and others
 FLAT, SIDE, UP = np.array([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 class Push(Task):
-    """A tool on two rails pushes a body to a place on the table. Actions move the tool; the goal is relative to where
-    the body stands in the scene.
+    """A tool on two rails pushes a body to a free place on the table. Actions move the tool; the goal is relative to
+    where the body stands in the scene.
 
     Options of `build`: `body`, a dynamic body that stands on something; None: the first one."""
 
@@ -32,19 +33,21 @@ class Push(Task):
         made = table() if scene is None else scene
         known, low, high = stands(made, body)
         self.body, start, tall = known.name, known.position, float(high[2] - low[2])
+        self.goal, ways = free(made, known, 0.15), free(made, known, 0.1)
         self.half, self.radius = float((high - low)[:2].max()) / 2, float(np.clip(0.25 * tall, 0.02, 0.05))
         self.floor, away = low[2], self.half + self.radius + 0.12
         place = np.array([start[0] - away, start[1], low[2] + max(0.3 * tall, 1.1 * self.radius)])
         cart = {"size": [0.05, 0.05, 0.05]}
-        made.add("cart", box=cart, position=place + 0.3 * UP, mass=0.5, collides_with=[])
-        made.add("tool", sphere={"radius": self.radius}, position=place, mass=0.5, collides_with=[self.body])
+        heavy = max(0.5, known.mass)  # kg: the motors' stiffness follows from what they move
+        made.add("cart", box=cart, position=place + 0.3 * UP, mass=heavy, collides_with=[])
+        made.add("tool", sphere={"radius": self.radius}, position=place, mass=heavy, collides_with=[self.body])
         motor = {"max_force": 30.0 + 20.0 * known.mass, "position": 0.0, "time": 0.05}
         made.join("rail_x", "slider", "cart", axis=(1, 0, 0), motor=motor)
         made.join("rail_y", "slider", "tool", "cart", axis=(0, 1, 0), motor=motor)
         self.start, self.rail = start[:2], place[:2]
         self.observe = [f"{kind} {name}" for name in (self.body, "tool") for kind in ("position", "velocity")]
         self.observe += ["joint_position rail_x", "joint_position rail_y"]
-        near = {"position": (start - 0.1 * FLAT, start + 0.1 * FLAT), "yaw": (-np.pi, np.pi)}
+        near = {"position": tuple(start + [*way, 0.0] for way in ways), "yaw": (-np.pi, np.pi)}
         material = {"friction": np.array([0.6, 1.2]) * known.friction, "mass": np.array([0.7, 1.3]) * known.mass}
         self.vary = {self.body: near | material}
         return made
@@ -162,6 +165,26 @@ def table() -> SceneBuilder:
     made = SceneBuilder(model="solver")
     made.add("table", box={"size": [1.0, 0.8, 0.04]}, position=(0, 0, 0.38), motion="static")
     return made.add("mug", cylinder={"radius": 0.04, "height": 0.1}, position=(0, 0, 0.45), mass=0.3)
+
+
+def free(made: SceneBuilder | Scene, body: Body, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and highest way in x and y, m, up to `reach`, by which a body may move without meeting others that
+    stand beside it."""
+    low, high = np.full(2, -reach), np.full(2, reach)
+    _, *own = stands(made, body.name)
+    for other in loaded(made).bodies:
+        if other.motion != "dynamic" or other.name == body.name or other.collides_with == ():
+            continue
+        _, *ends = stands(made, other.name)
+        least, most = ends[0] - own[1] - APART, ends[1] - own[0] + APART  # ways between these make their boxes meet
+        if least[2] < 0 < most[2]:
+            room = np.maximum(least, -most)[:2]
+            axis = int(room.argmax())
+            if least[axis] > -most[axis]:
+                high[axis] = np.clip(least[axis], 0.0, high[axis])
+            else:
+                low[axis] = np.clip(most[axis], low[axis], 0.0)
+    return low, high
 
 
 def stands(made: SceneBuilder | Scene, body: str | None) -> tuple[Body, np.ndarray, np.ndarray]:
