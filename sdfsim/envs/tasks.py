@@ -47,7 +47,7 @@ class Push(Task):
         self.start, self.rail = start[:2], place[:2]
         self.observe = [f"{kind} {name}" for name in (self.body, "tool") for kind in ("position", "velocity")]
         self.observe += ["joint_position rail_x", "joint_position rail_y"]
-        near = {"position": tuple(start + [*way, 0.0] for way in ways), "yaw": (-np.pi, np.pi)}
+        near = {"position": tuple(start + np.array([*way, 0.0]) for way in ways), "yaw": (-np.pi, np.pi)}
         material = {"friction": np.array([0.6, 1.2]) * known.friction, "mass": np.array([0.7, 1.3]) * known.mass}
         self.vary = {self.body: near | material}
         return made

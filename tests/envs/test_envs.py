@@ -91,6 +91,34 @@ def test_any_scene_becomes_an_environment(tmp_path):
     assert pushed(env).mean() >= 0.6
 
 
+def beside(turn: float) -> sdfsim.envs.Push:
+    """A heavy drum with a post on one side, a can on the other, and a lamp high above."""
+    scene = sdfsim.Scene(model="solver")
+    scene.add("table", box={"size": [1.2, 1.2, 0.04]}, position=(0, 0, -0.02), motion="static")
+    places = {"drum": (0, 0), "post": (0.25, 0.02), "can": (-0.01, -0.2), "lamp": (0.01, 0.0)}
+    for name, (x, y) in places.items():
+        radius, height = (0.12, 0.2) if name == "drum" else (0.05, 0.1)
+        place = (x * np.cos(turn) - y * np.sin(turn), x * np.sin(turn) + y * np.cos(turn), height / 2)
+        up = 0.5 * (name == "lamp")
+        scene.add(name, cylinder={"radius": radius, "height": height}, position=np.add(place, (0, 0, up)), mass=1.7)
+    return sdfsim.envs.Push(16, scene=scene, body="drum")
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_goals_and_starts_are_where_nothing_else_stands(quarter):
+    env = beside(quarter * np.pi / 2)
+    free = np.array([[-0.15, 0.07], [-0.02, 0.15]])  # of x and y, a centimetre from both
+    turned = [free, np.stack([-free[1, ::-1], free[0]]), -free[:, ::-1], np.stack([free[1], -free[0, ::-1]])][quarter]
+    np.testing.assert_allclose(np.transpose(env.goal), turned, atol=1e-9)
+    env.reset(seed=0)
+    starts = env.seen["position drum"][:, :2]
+    assert (starts >= np.maximum(turned[:, 0], -0.1) - 1e-9).all() and (starts <= np.minimum(turned[:, 1], 0.1)).all()
+
+
+def test_a_heavy_body_is_pushed_too():
+    assert pushed(beside(0.0)).mean() >= 0.75
+
+
 def test_wrong_input_is_one_clear_line(tmp_path):
     with pytest.raises(SdfsimError, match="obs_type: must be one of state, pixels"):
         sdfsim.envs.Push(1, obs_type="rgb")
