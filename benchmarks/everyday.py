@@ -41,6 +41,7 @@ from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units
 from sdfsim.scene.scene import Scene
 
+JUDGED = 40  # frames of a run, evenly spaced, in which overlaps are measured
 OURS, DRAKE, NEWTON = "sdfsim", "Drake", "Newton"
 ENGINES: dict[str, tuple[str, Engine | None]] = {  # package and runner of each
     OURS: ("sdfsim", None),
@@ -89,7 +90,8 @@ def runner(name: str, folder: Path, costs: list[tuple[float, float]] | None = No
             raise NotRun("too slow")
         if costs is not None:
             sizes = [largest_extent(scene.shapes[b.shape]) * b.scale for b in scene.bodies if b.motion == "dynamic"]
-            costs.append((took, depths(scene, found.rollout).max(initial=0.0) / min(sizes)))
+            every = -(-len(found.rollout) // JUDGED)
+            costs.append((took, depths(scene, found.rollout, every).max(initial=0.0) / min(sizes)))
         return found
 
     return run
