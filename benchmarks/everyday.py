@@ -23,6 +23,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.engines import bullet, drake, mujoco, mujoco_sdf, newton, rapier
 from benchmarks.records import Out, progress, write_record
 from benchmarks.rivals import in_pieces
@@ -101,7 +103,7 @@ def unknown_to(name: str, scene: Scene) -> str:
     """The coefficients of a scene that an engine cannot express; empty if there are none."""
     moving = [b for b in scene.bodies if b.motion == "dynamic"]
     others = [b for b in scene.bodies if b.motion == "static"]
-    if name != OURS and any(b.stiffness for b in scene.bodies):
+    if name != OURS and any(b.stiffness < np.inf for b in scene.bodies):
         return "materials of a given stiffness"
     if scene.joints and name != OURS and not name.startswith("MuJoCo"):
         return "joints"
