@@ -33,7 +33,8 @@ class Push(Task):
         made = table() if scene is None else scene
         known, low, high = stands(made, body)
         self.body, start, tall = known.name, known.position, float(high[2] - low[2])
-        self.goal, ways = free(made, known, 0.15), free(made, known, 0.1)
+        goals, ways = free(made, known, 0.15), free(made, known, 0.1)
+        self.goal = goals[0].tolist(), goals[1].tolist()
         self.half, self.radius = float((high - low)[:2].max()) / 2, float(np.clip(0.25 * tall, 0.02, 0.05))
         self.floor, away = low[2], self.half + self.radius + 0.12
         place = np.array([start[0] - away, start[1], low[2] + max(0.3 * tall, 1.1 * self.radius)])

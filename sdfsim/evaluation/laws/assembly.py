@@ -144,7 +144,8 @@ def spun(ran: Ran, name: str) -> np.ndarray:
 def gears(at: Setting) -> Iterator[Check]:
     """Two spur gears of 20 and 40 teeth of 5 mm, and a planet set of 18, 18 and 54 teeth of 2 mm: ten turns, without a
     tooth that is skipped."""
-    built, planets, spins = SceneBuilder(gravity=(0, 0, 0)), SceneBuilder(gravity=(0, 0, 0)), {"axis": (0, 0, 1)}
+    built, planets = SceneBuilder(gravity=(0, 0, 0)), SceneBuilder(gravity=(0, 0, 0))
+    spins: dict[str, Any] = {"axis": (0, 0, 1)}
     with TemporaryDirectory() as folder:
         mesh = Files(folder)
         for name, teeth, place, turn in (("small", 20, 0.0, 0.0), ("large", 40, 0.15, 180 + 180 / 40)):
