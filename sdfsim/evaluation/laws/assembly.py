@@ -95,8 +95,8 @@ def rollers(at: Setting) -> Iterator[Check]:
 
 
 def outline(teeth: int, module: float, tip: float = 1.0, root: float = 1.25, wider: float = -0.01) -> np.ndarray:
-    """A gear about z as corners [K, 2], its first tooth at +x: involute flanks at 20 degrees, teeth from `root` below
-    the pitch circle to `tip` above it, and half a tooth `wider` than half the pitch. Lengths in modules of `module`
+    """A gear about z as corners [K, 2] m, its first tooth at +x: involute flanks at 20 degrees, teeth from `root` below
+    the pitch circle to `tip` above it, and on each side `wider` than a quarter of the pitch, in modules of `module`
     m."""
     pitch, press = 0.5 * module * teeth, radians(20.0)
     low, base = pitch - root * module, pitch * cos(press)

@@ -21,7 +21,8 @@ from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
 ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
 STEEPEST = -0.1  # cosine below which they face each other
-LEVEL = 4.0  # slops: a body that is higher than the support by no more than this is not a wall, nor what is deeper
+# slops: what rises above a support by no more than this is no wall; a contact that is deeper than this always acts
+LEVEL = 4.0
 OPEN = -1.0  # in place of 0 or 1: whether a contact is void is not known yet
 AROUND = 12.0  # slops: distance from a contact within which triangles may be its wall
 
