@@ -107,9 +107,8 @@ def unknown_to(name: str, scene: Scene) -> str:
         return "materials of a given stiffness"
     if scene.joints and name != OURS and not name.startswith("MuJoCo"):
         return "joints"
-    if (name.startswith("MuJoCo") or name in (DRAKE, NEWTON)) and len(
-        {(b.friction, b.restitution) for b in moving}
-    ) > 1:
+    alike = len({(b.friction, b.restitution) for b in moving}) <= 1
+    if not alike and (name.startswith("MuJoCo") or name in (DRAKE, NEWTON)):
         return "coefficients of pairs of several materials"
     bounces = [one.restitution * other.restitution for one in moving[:1] for other in (*others, *moving[1:])]
     if name in (DRAKE, NEWTON) and any(bounces):

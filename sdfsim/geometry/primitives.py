@@ -170,6 +170,11 @@ def _quads(quads: np.ndarray) -> np.ndarray:
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
 
 
+def _spun(profile: np.ndarray, segments: int) -> np.ndarray:
+    """The profile at even angles about z: [S, K, 3]."""
+    return np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
+
+
 def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
     """Points [K, 2] of (radius, z) at the angle `turn` about z: [K, 3]."""
     return np.stack([profile[:, 0] * np.cos(turn), profile[:, 0] * np.sin(turn), profile[:, 1]], axis=1)
@@ -177,14 +182,14 @@ def _spin(profile: np.ndarray, turn: float) -> np.ndarray:
 
 def revolve(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a profile [K, 2] of (radius, z), both ends on the axis, turned about z."""
-    rings = np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments])
+    rings = _spun(profile, segments)
     # On the axis all copies of a point are one vertex and half of each quad vanishes; `clean` handles both.
     return _tube(rings, len(profile) - 1)
 
 
 def ring(profile: np.ndarray, segments: int) -> Mesh:
     """The solid of a closed profile [K, 2] of (radius, z), counter-clockwise, turned about z."""
-    return _tube(np.stack([_spin(profile, turn) for turn in 2 * np.pi * np.arange(segments) / segments]))
+    return _tube(_spun(profile, segments))
 
 
 def _tube(rings: np.ndarray, strips: int | None = None) -> Mesh:

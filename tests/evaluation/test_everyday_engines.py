@@ -18,6 +18,7 @@ from benchmarks.everyday import (
     GROUPS,
     OURS,
     NotRun,
+    cell,
     counted,
     is_installed,
     judged,
@@ -32,7 +33,7 @@ from sdfsim.evaluation.engines import by_model, still
 from sdfsim.evaluation.laws.check import Check, most, near
 from sdfsim.evaluation.laws.scenes import UNIT, G, Law, Put, Setting, about, fixed, floor, run, solid
 from sdfsim.evaluation.laws.table import ROWS
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Joint, Scene
 
 FAST = ["PyBullet", "MuJoCo"]
 INSTALLED = [name for name in ENGINES if name != OURS and is_installed(name)]
@@ -223,6 +224,19 @@ def test_the_table_counts_and_names_what_is_missed_or_absent():
         ("all", "1 / 2", "3 / 3, 2 not run", *others),
     ]  # fmt: skip
     assert "- edges: b" in notes and "- PyBullet: slow, 2 checks" in notes
+
+
+def test_costs_stand_beside_the_checks_that_hold():
+    assert cell({"held": ["a"], "missed": ["b"], "not_run": {}, "cost": [1.5, 0.012]}) == "1 / 2, 1.5 s, 1.2 %"
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_engines_are_given_no_soft_materials_and_only_mujoco_joints(name):
+    scene = scene_of(Put("it", CUBE, [0, 0, 2]), floor())
+    soft = replace(scene, bodies=(replace(scene.bodies[0], stiffness=1e4), scene.bodies[1]))
+    held = replace(scene, joints=(Joint("hinge", "hinge", (0, -1), np.zeros(3), np.array([0.0, 0.0, 1.0])),))
+    assert unknown_to(name, scene) == "" and "stiffness" in unknown_to(name, soft)
+    assert unknown_to(name, held) == ("" if name == "MuJoCo" else "joints")
 
 
 def test_every_engine_names_its_package():
