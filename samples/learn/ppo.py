@@ -55,10 +55,11 @@ def train(env: Any, folder: Path, steps: int, seed: int = 0) -> Policy:
     seen, _ = env.reset(seed=seed + done)
     while done < steps:
         began = time.process_time()
+        left = 1.0 - done / steps
         for group in optimiser.param_groups:
-            group["lr"] = RATE * max(0.1, 1.0 - done / steps)
+            group["lr"] = RATE * max(0.1, left)
         batch, seen, wins = rollout(env, policy, seen)
-        update(policy, optimiser, *batch)
+        update(policy, optimiser, left * ENTROPY, *batch)
         done += HORIZON * env.num_envs
         spent += time.process_time() - began
         with curve.open("a", newline="") as out:
@@ -95,7 +96,7 @@ def rollout(env: Any, policy: Policy, seen: np.ndarray) -> tuple[tuple[torch.Ten
     return tuple(part.flatten(0, 1) for part in parts), seen, float(np.mean(ended)) if ended else 0.0
 
 
-def update(policy: Policy, optimiser: torch.optim.Optimizer, *batch: torch.Tensor) -> None:
+def update(policy: Policy, optimiser: torch.optim.Optimizer, entropy: float, *batch: torch.Tensor) -> None:
     observed, actions, likely, advantage, returns, _ = batch
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     for _ in range(EPOCHS):
@@ -104,7 +105,7 @@ def update(policy: Policy, optimiser: torch.optim.Optimizer, *batch: torch.Tenso
             ratio = (chosen.log_prob(actions[rows]).sum(1) - likely[rows]).exp()
             gain = torch.minimum(ratio * advantage[rows], ratio.clamp(1 - CLIP, 1 + CLIP) * advantage[rows]).mean()
             miss = (policy.value(observed[rows])[:, 0] - returns[rows]).pow(2).mean()
-            loss = 0.5 * miss - gain - ENTROPY * chosen.entropy().sum(1).mean()
+            loss = 0.5 * miss - gain - entropy * chosen.entropy().sum(1).mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

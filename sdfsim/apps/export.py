@@ -38,7 +38,7 @@ from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Body, Effects, Joint, Scene
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import COMMON_FORMS, BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.shape.shape import RECORD_FILE, Shape, load_shape, own_pieces
 from sdfsim.simulate.looks import body_colors, framed, is_infinite, shown, with_normals
 
@@ -361,8 +361,8 @@ def _solid(shape: Shape) -> Mesh:
 def _write_assets(
     take: Take, out: Path, cuts: Callable[[Body], bool], on_progress: StageProgress
 ) -> tuple[dict[int, Path], dict[int, list[Path]]]:
-    """Write OBJ files to `NAME_assets/`. Returns them by the index of each shape without a closed form: the shown mesh,
-    and its convex pieces if a body `cuts` it."""
+    """Write OBJ files to `NAME_assets/`. Returns them by the index of each shape that engines do not have: the shown
+    mesh, and its convex pieces if a body `cuts` it."""
     folder, shapes = out.with_name(f"{out.stem}_assets"), take.scene.shapes
 
     def obj(name: str, mesh: Mesh) -> Path:
@@ -371,7 +371,7 @@ def _write_assets(
         return folder / f"{name}.obj"
 
     used = sorted({body.shape for body in take.scene.bodies})
-    drawn = [k for k in used if not isinstance(shapes[k].sdf, ClosedForm)]
+    drawn = [k for k in used if not isinstance(shapes[k].sdf, COMMON_FORMS)]
     wanted = {body.shape for body in take.scene.bodies if cuts(body)}
     seen, cut = {}, {}
     for done, k in enumerate(drawn):
@@ -481,7 +481,7 @@ def _gltf_physics(take: Take, file: GltfWriter) -> None:
                 "linearVelocity": back.apply(body.velocity).tolist(),
                 "angularVelocity": back.apply(body.angular_velocity).tolist(),
             }  # fmt: skip
-        if isinstance(shape.sdf, ClosedForm):
+        if isinstance(shape.sdf, COMMON_FORMS):
             geometries = [{"shape": forms.setdefault(shape.sdf.scaled(body.scale), len(forms))}]
         elif body.motion != "dynamic":
             geometries = [{"node": k}]
@@ -641,7 +641,7 @@ def _usd_geometry(take: Take, shape: Shape, dynamic: bool, stage: Any, path: str
     """Write prims below `path` for display and collision."""
     gf, geom = _pxr("Gf"), _pxr("UsdGeom")
     form, solid = shape.sdf, f"{path}/solid"
-    if isinstance(form, ClosedForm):
+    if isinstance(form, COMMON_FORMS):
         if isinstance(form, SphereSdf):
             sizes: dict[str, Any] = {"radius": form.radius}
         elif isinstance(form, BoxSdf):
@@ -824,7 +824,7 @@ def _refined(take: Take) -> tuple[Take, list[str]]:
     for body in scene.bodies:
         shape = scene.shapes[body.shape]
         moment = np.linalg.eigvalsh(_inertia(body, shape))[0] if body.motion == "dynamic" else np.inf
-        meshed = not isinstance(shape.sdf, ClosedForm)
+        meshed = not isinstance(shape.sdf, COMMON_FORMS)
         size = body.scale * float(np.ptp(shape.mesh.vertices, axis=0).max()) if meshed else np.inf
         small += [body.name] if moment < LEAST_MOMENT or size < LEAST_SIZE else []
     if not small:

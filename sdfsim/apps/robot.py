@@ -17,6 +17,7 @@ from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import WORLD
 from sdfsim.shape.parts import GREY, Part, color_of, mesh_of, moved, pose_of, primitive_of, skin_of, solid_of, textured
+from sdfsim.shape.round_form import round_form
 from sdfsim.shape.shape import Shape
 
 FLOOR = "floor"
@@ -385,6 +386,9 @@ def _body(link: Link, notes: list[str]) -> tuple[Shape | None, dict[str, Any], n
         notes.append(f"link {link.name} has no shape: a ball of {radius:.3g} m that touches nothing replaces it")
         parts = [Part("sphere", pose_of(link.com), {"radius": radius})]
     density = 1000.0
+    if link.solid and len(parts) == 1 and parts[0].mesh is not None and (form := round_form(parts[0].mesh)):
+        parts = [replace(parts[0], kind=form.kind, pose=parts[0].pose @ form.pose, sizes=form.sizes, mesh=None)]
+        notes.append(f"link {link.name}: {form}")
     if len(parts) == 1 and parts[0].mesh is None:
         frame, shape = parts[0].pose, primitive_of(parts[0], link.name)
         keys: dict[str, Any] = {parts[0].kind: {key: _round(value) for key, value in parts[0].sizes.items()}}

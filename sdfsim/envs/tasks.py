@@ -39,7 +39,7 @@ class Push(Task):
         self.floor, away = low[2], self.half + self.radius + 0.12
         place = np.array([start[0] - away, start[1], low[2] + max(0.3 * tall, 1.1 * self.radius)])
         cart = {"size": [0.05, 0.05, 0.05]}
-        heavy = max(0.5, known.mass)  # kg: the motors' stiffness follows from what they move
+        heavy = max(0.5, 5 / 3 * known.mass)  # kg: the motors' stiffness follows from what they move
         made.add("cart", box=cart, position=place + 0.3 * UP, mass=heavy, collides_with=[])
         made.add("tool", sphere={"radius": self.radius}, position=place, mass=heavy, collides_with=[self.body])
         motor = {"max_force": 30.0 + 20.0 * known.mass, "position": 0.0, "time": 0.05}

@@ -16,7 +16,7 @@ import numpy as np
 from sdfsim.geometry.bvh import Winding
 from sdfsim.geometry.mesh import Mesh, convex_hull
 from sdfsim.geometry.primitives import box
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import COMMON_FORMS, BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape.shape import Shape
 
@@ -54,8 +54,9 @@ class TrueSurface:
 
 
 def true_surface(shape: Shape) -> TrueSurface:
-    """The exact geometry of a shape: its closed form, its convex pieces, or its mesh."""
-    if isinstance(shape.sdf, ClosedForm):
+    """The exact geometry of a shape: its closed form, its convex pieces, or its mesh. A cone and a torus are finely
+    faceted."""
+    if isinstance(shape.sdf, COMMON_FORMS):
         return _closed_form(shape.sdf)
     if shape.pieces:
         pieces = [convex_hull(points) for points in shape.pieces]
@@ -137,21 +138,20 @@ def of_mesh(mesh: Mesh) -> TrueSurface:
         answer = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
         squared, face, closest = (np.asarray(part) for part in answer)
         length, normal, away = np.sqrt(squared), normals[face], points - closest
-        # Inside a convex solid, and wherever the nearest point is within a face, the way to the surface is along the
-        # normal. At other edges the winding number gives the sign; at those of convex solids no face is hidden.
+        # Wherever the nearest point is within a face, the way to the surface is along the normal. At edges the winding
+        # number gives the sign; of those of convex solids only where a face looks away.
         height = (away * normal).sum(1)
         inside = height < -0.5 * length
-        if not convex:
-            a, b, c = (corner[face, k] for k in range(3))
-            parts = [(np.cross(q - p, closest - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))]
-            unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0)
-            if unclear.any():
-                inside[unclear] = winding(points[unclear]) > 0.5
-            # If a surface is folded flat, the nearest layer may face the other way. Behind an open surface the winding
-            # number is a fraction.
-            behind = inside & ~unclear
-            if behind.any():
-                inside[behind] = winding(points[behind]) > TURN
+        a, b, c = (corner[face, k] for k in range(3))
+        parts = [(np.cross(q - p, closest - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))]
+        unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0) & (inside | (not convex))
+        if unclear.any():
+            inside[unclear] = winding(points[unclear]) > 0.5
+        # If a surface is folded flat, the nearest layer may face the other way. Behind an open surface the winding
+        # number is a fraction.
+        behind = inside & ~unclear
+        if not convex and behind.any():
+            inside[behind] = winding(points[behind]) > TURN
         found = np.where(inside, -length, length)
         near = length < 1e-9 * size
         return found, np.where(near[:, None], normal, away / np.where(near, 1.0, found)[:, None])

@@ -25,12 +25,15 @@ class BodyKeys(TypedDict, total=False):
     capsule: Group | None
     box: Group | None
     cylinder: Group | None
+    cone: Group | None
+    torus: Group | None
     plane: Group | None
     parts: Sequence[Group] | None
     units: Literal["m", "cm", "mm", "in"] | None
     cap: Switch | None
     thicken: float | None
     centre: Switch | None
+    round: Literal["auto", "off"] | None
     wall: float | None
     sdf: SdfKind | None
     resolution: int | None

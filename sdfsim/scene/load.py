@@ -31,6 +31,7 @@ from sdfsim.scene.schema import (
 )
 from sdfsim.shape.make import analytic_shape, far_origin, shape_from_mesh, shape_from_primitive
 from sdfsim.shape.parts import Part, color_of, moved, pose_of, skin_of, solid_of
+from sdfsim.shape.round_form import round_form
 from sdfsim.shape.shape import SdfKind, Shape, centred, load_shape, with_nodes, with_sdf, with_wall
 
 
@@ -71,13 +72,15 @@ def load_scene(
 
 def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
     """The scene of its tables. Raises SceneError with every fault found."""
-    same, shapes = _load_shapes(table, faults, on_progress)
+    same, shapes, turned = _load_shapes(table, faults, on_progress)
     number = {key: i for i, key in enumerate(dict.fromkeys(same.values()))}
     groups = {body.name: body.names() for body in table.bodies}
     bodies: list[Body] = []
     for i, entry in enumerate(table.bodies):
         shape = shapes[same[entry.shape]]
         made = _body(entry, number[same[entry.shape]], table.motion_of(entry), groups)
+        if (own := turned.get(same[entry.shape])) is not None:
+            made = _turned(made, own)
         if made.motion == "dynamic":
             made = replace(made, mass=_mass(entry, shape, partial(faults.wrong, ("bodies", i, "name"))))
             if entry.inertia_factor != 1.0 and made.mass > 0.0:
@@ -109,23 +112,29 @@ def scene_of(table: SceneTable, faults: Faults, on_progress: Progress) -> Scene:
         notes=notes,
         caveats=tuple(f"{s.name}: {s.certificate['caveat']}" for s in fitted if s.certificate.get("caveat")),
         joints=joints,
-        **_poses_of(table, bodies),
+        **_poses_of(table, bodies, [turned.get(same[body.shape]) for body in table.bodies for _ in body.names()]),
     )
 
 
-def _poses_of(table: SceneTable, bodies: list[Body]) -> dict[str, Any]:
-    """The frames, keyframes and couplings of a scene."""
+def _poses_of(table: SceneTable, bodies: list[Body], turned: list[np.ndarray | None]) -> dict[str, Any]:
+    """The frames, keyframes and couplings of a scene, for bodies whose shapes have the frames `turned` in their
+    meshes."""
     number = {WORLD: -1} | {body.name: k for k, body in enumerate(bodies)}
     joint = {entry.name: j for j, entry in enumerate(table.joints)}
-    frames = (Frame(f.name, number[f.body], np.array(f.position), f.rotation()) for f in table.frames)
+    known = [Frame(f.name, number[f.body], np.array(f.position), f.rotation()) for f in table.frames]
+    named = {frame.name for frame in known}
+    own = [k for k, at in enumerate(turned) if at is not None and bodies[k].name not in named]
+    known += [Frame(bodies[k].name, k, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])) for k in own]
+    frames = [_in_round(f, bodies[f.body].scale, turned[f.body]) if f.body >= 0 else f for f in known]
 
-    def pose(key: KeyframeTable) -> Keyframe:
+    def keyframe(key: KeyframeTable) -> Keyframe:
         angles = {name: math.radians(angle) for name, angle in key.angles_deg.items()}
         turns = {name: np.array(quat) for name, quat in key.quats_xyzw.items()}
-        there = {
-            name: (np.array(at.position), at.rotation(), np.array(at.velocity), np.array(at.angular_velocity))
-            for name, at in key.bodies.items()
-        }
+        there = {}
+        for name, at in key.bodies.items():
+            k = number[name]
+            place = _onto(np.array(at.position), at.rotation(), bodies[k].scale, turned[k])
+            there[name] = (*place, np.array(at.velocity), np.array(at.angular_velocity))
         return Keyframe(angles | key.positions | turns, there, key.speeds | key.spins, key.targets)
 
     def coupling(of: CouplingTable) -> Coupling:
@@ -133,15 +142,50 @@ def _poses_of(table: SceneTable, bodies: list[Body]) -> dict[str, Any]:
         turns = table.joints[first].type == "hinge"
         return Coupling((first, second), of.ratio, math.radians(of.offset_deg) if turns else of.offset)
 
-    keyframes = {name: pose(key) for name, key in table.keyframes.items()}
+    keyframes = {name: keyframe(key) for name, key in table.keyframes.items()}
     return {"frames": tuple(frames), "keyframes": keyframes, "couplings": tuple(map(coupling, table.couplings))}
+
+
+def _onto(
+    position: np.ndarray, quat_xyzw: np.ndarray, scale: float, own: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The position [..., 3] and orientation [..., 4] of a round shape whose frame is `own` [4, 4] in its mesh, from
+    those of the mesh."""
+    if own is None:
+        return position, quat_xyzw
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    turn = Rotation.from_quat(quat_xyzw)
+    return position + turn.apply(scale * own[:3, 3]), (turn * Rotation.from_matrix(own[:3, :3])).as_quat()
+
+
+def _turned(body: Body, own: np.ndarray) -> Body:
+    """A body placed by its mesh, placed by the round shape whose frame is `own` in that."""
+    position, quat = _onto(body.position, body.quat_xyzw, body.scale, own)
+    path = body.path
+    if path is not None:
+        place, turns = _onto(path.position, path.quat_xyzw, body.scale, own)
+        path = replace(path, position=place, quat_xyzw=turns)
+    return replace(body, position=position, quat_xyzw=quat, path=path)
+
+
+def _in_round(frame: Frame, scale: float, own: np.ndarray | None) -> Frame:
+    """A frame in a mesh, in the round shape whose frame is `own` in that."""
+    if own is None:
+        return frame
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    back = Rotation.from_matrix(own[:3, :3]).inv()
+    quat = (back * Rotation.from_quat(frame.quat_xyzw)).as_quat()
+    return replace(frame, position=back.apply(frame.position - scale * own[:3, 3]), quat_xyzw=quat)
 
 
 def _load_shapes(
     table: SceneTable, faults: Faults, on_progress: Progress
-) -> tuple[dict[str | None, str | None], dict[str | None, Shape]]:
+) -> tuple[dict[str | None, str | None], dict[str | None, Shape], dict[str | None, np.ndarray]]:
     """Load the shapes in use. Returns for each key, in order of first use, the first key with the same entry (in Python
-    every body may bring its own copy of a mesh), and the shapes of these first keys. The key None is the plane that all
+    every body may bring its own copy of a mesh); the shapes of these first keys; and the frames [4, 4] of those that
+    are round in place of their meshes, in these. The key None is the plane that all
     bodies with a `plane` share. Shapes that must be fitted or sampled are made last, when all else is valid: a fit
     takes a minute."""
     first: dict[str, str] = {}
@@ -149,6 +193,7 @@ def _load_shapes(
     for key in dict.fromkeys(body.shape for body in table.bodies):
         same[key] = key and first.setdefault(table.shapes[key].model_dump_json(exclude_unset=True), key)
     shapes: dict[str | None, Shape] = {None: analytic_shape("plane", name="plane")}
+    turned: dict[str | None, np.ndarray] = {}
     scales: dict[str | None, list[float]] = {}
     for body in table.bodies:
         scales.setdefault(same[body.shape], []).append(body.scale)
@@ -164,12 +209,29 @@ def _load_shapes(
 
             try:
                 told = silent if on_progress is silent else report
+                if found := _as_round(key, table.shapes[key]):
+                    shapes[key], turned[key] = found
+                    continue
                 shapes[key] = _load_shape(key, table.shapes[key], scales[key], own, told)
             except SdfsimError as error:
                 hint = f" ({error.hint})" if error.hint else ""
                 faults.wrong(("shapes", key, table.shapes[key].kind), error.message + hint)
         faults.check()
-    return same, shapes
+    return same, shapes, turned
+
+
+def _as_round(name: str, entry: ShapeTable) -> tuple[Shape, np.ndarray] | None:
+    """The round solid that a mesh is up to its facets, and its frame [4, 4] in the mesh; None if it is none, or is not
+    asked for."""
+    if entry.mesh is None or entry.round == "off":
+        return None
+    loaded, units = load_textured(entry.mesh), UNITS[entry.units] * np.eye(4)
+    form = round_form(moved(loaded.mesh, units))
+    if form is None:
+        return None
+    shape = analytic_shape(form.kind, name=name, **form.sizes)
+    skin = skin_of([Part("mesh", pose_of(), {}, moved(loaded.skin or loaded.mesh, units))], form.pose)
+    return replace(shape, skin=skin, source=shape.source | {"notes": [str(form)]}), form.pose
 
 
 def _load_shape(name: str, entry: ShapeTable, scales: list[float], own: SdfKind, on_progress: Progress) -> Shape:
@@ -182,6 +244,9 @@ def _load_shape(name: str, entry: ShapeTable, scales: list[float], own: SdfKind,
         units = UNITS[entry.units] if "units" in entry.model_fields_set else None
         made |= {"units": units, "scales": scales, "cap": entry.cap == "on", "thicken": entry.thicken}
         shape = shape_from_mesh(entry.mesh, **made)
+        if entry.round == "auto":
+            notes = [*shape.source.get("notes", []), "its mesh is no round solid: it collides as it is"]
+            shape = replace(shape, source=shape.source | {"notes": notes})
     elif entry.primitive:
         shape = shape_from_primitive(entry.primitive.name, entry.primitive.size, **made)
     elif entry.parts:

@@ -291,11 +291,29 @@ class Box(Table):
     size: Annotated[list[Annotated[Number, Field(gt=0)]], _THREE] = key("extents along x, y, z", unit="m")
 
 
+class Cone(Table):
+    """An exact cone along z, its tip up, the middle of its height at the origin."""
+
+    radius: Number = key("radius of its base", unit="m", gt=0)
+    height: Number = key("along z", unit="m", gt=0)
+
+
+class Torus(Table):
+    """An exact ring around z, about the origin."""
+
+    radius: Number = key("radius of the circle in the middle of its tube", unit="m", gt=0)
+    tube: Number = key("radius of its tube, below that of the circle", unit="m", gt=0)
+
+    def check_values(self) -> Iterator[Fault]:
+        if self.tube >= self.radius:
+            yield ("tube",), f"must be below the radius of the circle (got {self.tube:g} m)"
+
+
 class PlaneShape(Table):
     """z = 0, infinite. It takes no keys: tilt it by the body's pose, or give the body its own `plane`."""
 
 
-_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "plane", "parts")
+_KINDS = ("asset", "mesh", "primitive", "sphere", "capsule", "cylinder", "box", "cone", "torus", "plane", "parts")
 OF_PART = ("mesh", "sphere", "capsule", "cylinder", "box")
 FITTED = ("mesh", "primitive")  # made on first use, which may take a minute
 _WITH_SDF = ("asset", *FITTED)  # the other kinds have an exact SDF
@@ -364,6 +382,8 @@ class ShapeTable(Table):
     capsule: Capsule | None = key("an exact capsule", None)
     cylinder: Upright | None = key("an exact cylinder", None)
     box: Box | None = key("an exact box", None)
+    cone: Cone | None = key("an exact cone", None)
+    torus: Torus | None = key("an exact ring", None)
     plane: PlaneShape | None = key("an infinite plane", None)
     parts: Annotated[list[PartTable], Field(min_length=1)] | None = key("several of these as one body", None)
     units: Literal["m", "cm", "mm", "in"] = key("unit of the numbers in a mesh file", "m")
@@ -381,6 +401,11 @@ class ShapeTable(Table):
         "N of the N^3 grid whose points become surface nodes; by default a shape keeps its own", None, ge=3, le=128
     )
     centre: Literal["on", "off"] = key("moves the origin of an asset or a mesh to its centre of mass", "off")
+    round: Literal["auto", "off"] = key(
+        "whether a mesh that is a sphere, cylinder, capsule, cone or ring up to its facets collides as one; the body's "
+        "frame is then that of the round shape, and a frame of its name that of the mesh",
+        "off",
+    )
     wall: Number | None = key(
         "makes the shape hollow: only the layer of this thickness below its surface has mass", None, "m", gt=0
     )
@@ -389,7 +414,7 @@ class ShapeTable(Table):
     def check_keys(cls, data: dict) -> Iterator[Fault]:
         yield from _one_of(data, _KINDS, required=True)
         kind = next((key for key in data if key in _KINDS), None)
-        for key in ("units", "cap", "thicken"):
+        for key in ("units", "cap", "thicken", "round"):
             if key in data and kind not in ("mesh", None):
                 yield (key,), f"is for mesh only (this is a {kind})"
         if "centre" in data and kind not in (*_WITH_SDF, "parts", None):
@@ -910,7 +935,7 @@ _SECTIONS: dict[str, dict[str, type[Table]]] = {
     "The file": {"": SceneTable, "effects": EffectsTable},
     "shapes: NAME": {
         "": ShapeTable, "primitive": Primitive, "sphere": Sphere, "capsule": Capsule, "cylinder": Upright, "box": Box,
-        "plane": PlaneShape, "parts[]": PartTable,
+        "cone": Cone, "torus": Torus, "plane": PlaneShape, "parts[]": PartTable,
     },
     "bodies[]": {"": BodyTable, "plane": Plane, "arrange": Arrange, "path[]": Waypoint},
     "joints[]": {"": JointTable, "spring": SpringTable, "motor": MotorTable, "breaks_at": BreaksTable},

@@ -1,4 +1,4 @@
-"""Signed distances in closed form: plane, ball, box, capsule, cylinder."""
+"""Signed distances in closed form: plane, ball, box, capsule, cylinder, cone, torus."""
 
 from __future__ import annotations
 
@@ -146,12 +146,8 @@ class CylinderSdf(ClosedForm):
         return self.radius, self.radius, self.half
 
     def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        tiny, radius, half = np.finfo(points.dtype).tiny, points.dtype.type(self.radius), points.dtype.type(self.half)
-        away = _norm(points[:, :2])
-        outward = np.zeros_like(points)
-        outward[:, 0] = 1.0
-        unit = points[:, :2] / np.maximum(away, tiny)[:, None]
-        outward[:, :2] = np.where((away > tiny)[:, None], unit, outward[:, :2])
+        radius, half = points.dtype.type(self.radius), points.dtype.type(self.half)
+        away, outward = _outward(points)
         end = np.zeros_like(points)
         end[:, 2] = np.where(points[:, 2] < 0, -1.0, 1.0)
         aside, above = away - radius, np.abs(points[:, 2]) - half
@@ -164,7 +160,67 @@ class CylinderSdf(ClosedForm):
         return distance, gradient
 
 
-CLOSED_FORMS = {kind.KIND: kind for kind in (PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf)}
+@dataclass(frozen=True, eq=False)
+class ConeSdf(ClosedForm):
+    """A cone about z: a disc of `radius` m at z = -`half` m, and its tip at z = `half`. Inside, the gradient points to
+    the side or the disc, whichever is nearer."""
+
+    KIND = "cone"
+    radius: float
+    half: float
+
+    def _reach(self) -> tuple[float, ...]:
+        return self.radius, self.radius, self.half
+
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        away, outward = _outward(points)
+        slant = np.hypot(self.radius, 2.0 * self.half)
+        x, z = away - self.radius, points[:, 2] + self.half  # from the rim
+        sine, cosine = self.radius / slant, 2.0 * self.half / slant
+        beyond_side, along = cosine * x + sine * z, np.clip(cosine * z - sine * x, 0.0, slant)
+        to_side, to_disc = (x + sine * along, z - cosine * along), (np.maximum(x, 0.0), z)
+        side_far, disc_far = np.hypot(*to_side), np.hypot(*to_disc)
+        inside = (beyond_side <= 0.0) & (z >= 0.0)
+        side = np.where(inside, beyond_side >= -z, side_far <= disc_far)
+        length = np.where(side, side_far, disc_far)
+        distance = np.where(inside, np.where(side, beyond_side, -z), length)
+        divisor = np.where(inside, 1.0, np.maximum(length, np.finfo(points.dtype).tiny))
+        across = np.where(inside, cosine * side, np.where(side, to_side[0], to_disc[0]) / divisor)
+        up = np.where(inside, np.where(side, sine, -1.0), np.where(side, to_side[1], to_disc[1]) / divisor)
+        gradient = across[:, None] * outward + up[:, None] * _up(points)
+        return distance.astype(points.dtype), gradient.astype(points.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class TorusSdf(ClosedForm):
+    """A ring about z: all points within `tube` m of a circle of `radius` m. On its circle the gradient points up."""
+
+    KIND = "torus"
+    radius: float
+    tube: float
+
+    def _reach(self) -> tuple[float, ...]:
+        return self.radius + self.tube, self.radius + self.tube, self.tube
+
+    def _measure(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        _, outward = _outward(points)
+        return SphereSdf(self.tube)._measure(points - points.dtype.type(self.radius) * outward)
+
+
+CLOSED_FORMS = {kind.KIND: kind for kind in (PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf, ConeSdf, TorusSdf)}
+# Those that other programs have too.
+COMMON_FORMS = PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf
+
+
+def _outward(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances [P] from the z axis, and the unit directions [P, 3] away from it; x on the axis."""
+    away = _norm(points[:, :2])
+    tiny = np.finfo(points.dtype).tiny
+    outward = np.zeros_like(points)
+    outward[:, 0] = 1.0
+    unit = points[:, :2] / np.maximum(away, tiny)[:, None]
+    outward[:, :2] = np.where((away > tiny)[:, None], unit, outward[:, :2])
+    return away, outward
 
 
 def _up(points: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from sdfsim.sdf.baked_grid import (
     surface_samples,
     unseen_wall,
 )
-from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, CylinderSdf, PlaneSdf
+from sdfsim.sdf.closed_forms import BoxSdf, ClosedForm, ConeSdf, CylinderSdf, PlaneSdf, TorusSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.mlp import MlpSdf
 from sdfsim.sdf.reference import PiecesDistance
@@ -107,7 +108,7 @@ class ContactGeometry:
     @cached_property
     def solids(self) -> tuple[ConvexPiece, ...]:
         """The convex solids that the shape collides as: its pieces, its closed form, or its own hull. Empty for a
-        plane, and for a shape that is not convex and has no pieces."""
+        plane or torus, and for a shape that is not convex and has no pieces."""
         if self.pieces:
             return tuple(hull(piece) for piece in self.pieces)
         if isinstance(self.sdf, ClosedForm):
@@ -146,9 +147,9 @@ class ContactGeometry:
 
     def _surface(self) -> dict[str, np.ndarray]:
         sdf, grid = self.sdf, self.grid
-        if isinstance(sdf, BoxSdf | CylinderSdf) and len(self.nodes):
+        if isinstance(sdf, BoxSdf | CylinderSdf | ConeSdf | TorusSdf) and len(self.nodes):
             spacing = max(0.5 * min(sdf.sizes), np.sqrt(_area(sdf) / DENSEST))
-            nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _on_cylinder(sdf, spacing)
+            nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _revolved(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
             nodes, samples = self.nodes, self.nodes[:0]
@@ -289,10 +290,14 @@ def _ball(places: np.ndarray, around: np.ndarray) -> np.ndarray:
     return np.array([[*middle, (np.linalg.norm(places - middle, axis=1) + around).max()]])
 
 
-def _area(sdf: BoxSdf | CylinderSdf) -> float:
+def _area(sdf: BoxSdf | CylinderSdf | ConeSdf | TorusSdf) -> float:
     if isinstance(sdf, BoxSdf):
         a, b, c = sdf.half
         return 8.0 * (a * b + b * c + c * a)
+    if isinstance(sdf, TorusSdf):
+        return 4.0 * np.pi**2 * sdf.radius * sdf.tube
+    if isinstance(sdf, ConeSdf):
+        return np.pi * sdf.radius * (sdf.radius + float(np.hypot(sdf.radius, 2.0 * sdf.half)))
     return 2.0 * np.pi * sdf.radius * (sdf.radius + 2.0 * sdf.half)
 
 
@@ -304,13 +309,29 @@ def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
     return np.unique(np.concatenate(sides), axis=0)
 
 
-def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
-    """Points all over a cylinder, at most `spacing` m apart, rims included."""
-    around = 2.0 * np.pi * np.arange(count := max(8, int(np.ceil(2.0 * np.pi * sdf.radius / spacing)))) / count
-    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
-    heights = np.linspace(-sdf.half, sdf.half, 1 + max(1, int(np.ceil(2.0 * sdf.half / spacing))))
-    radii = np.linspace(0.0, sdf.radius, 1 + max(1, int(np.ceil(sdf.radius / spacing))))[:-1]
-    side = [np.column_stack([sdf.radius * circle, np.full(count, z)]) for z in heights]
-    ends = [np.column_stack([r * circle, np.full(count, z)]) for z in (-sdf.half, sdf.half) for r in radii[1:]]
-    tips = [np.array([[0.0, 0.0, -sdf.half], [0.0, 0.0, sdf.half]])]
-    return np.concatenate([*side, *ends, *tips])
+def _revolved(sdf: CylinderSdf | ConeSdf | TorusSdf, spacing: float) -> np.ndarray:
+    """Points all over a solid of revolution about z, rims and tips included: rings of points at most `spacing` m apart
+    around places on its outline that are as close."""
+    if isinstance(sdf, TorusSdf):
+        turns = _turns(2.0 * np.pi * sdf.tube, spacing)
+        outline = np.stack([sdf.radius + sdf.tube * np.cos(turns), sdf.tube * np.sin(turns)], axis=1)
+    else:
+        top = sdf.radius if isinstance(sdf, CylinderSdf) else 0.0
+        corners = np.array([[0.0, -sdf.half], [sdf.radius, -sdf.half], [top, sdf.half], [0.0, sdf.half]])
+        outline = corners[:1]
+        for start, end in pairwise(corners):
+            parts = int(np.ceil(np.linalg.norm(end - start) / spacing))
+            outline = np.concatenate(
+                [outline, start + np.arange(1, parts + 1)[:, None] / max(parts, 1) * (end - start)]
+            )
+    rings = []
+    for r, z in outline:
+        turns = _turns(2.0 * np.pi * r, spacing)
+        rings.append(np.column_stack([r * np.cos(turns), r * np.sin(turns), np.full(len(turns), z)]))
+    return np.concatenate(rings)
+
+
+def _turns(length: float, spacing: float) -> np.ndarray:
+    """Angles, rad, of points around a circle of `length` m; one for a circle of no size."""
+    count = max(8, int(np.ceil(length / spacing))) if length > 0.0 else 1
+    return 2.0 * np.pi * np.arange(count) / count

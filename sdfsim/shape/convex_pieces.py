@@ -7,7 +7,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf
 from sdfsim.sdf.sdf import Sdf
 
 FLAT = 1e-6  # faces whose unit normals differ by less are one face
@@ -20,7 +20,7 @@ CORNERS = 64  # corners of a face at most; of a face with more, this many evenly
 class ConvexPiece:
     """One convex solid in the frame of its shape, at scale 1."""
 
-    kind: str  # "sphere", "capsule", "box", "cylinder" or "hull"
+    kind: str  # "sphere", "capsule", "box", "cylinder", "cone" or "hull"
     sizes: tuple[float, ...]  # m, as the closed form has them; empty for a hull
     ball: np.ndarray  # [4] m, centre and radius of a ball around it
     thickness: float  # m, the least distance of two parallel planes that enclose it, among face normals
@@ -32,7 +32,7 @@ class ConvexPiece:
 
 
 def closed_form(sdf: Sdf) -> ConvexPiece | None:
-    """The convex piece of a closed form; None for a plane and for other SDFs."""
+    """The convex piece of a closed form; None for a plane, a torus and other SDFs."""
     if isinstance(sdf, SphereSdf):
         return ConvexPiece("sphere", sdf.sizes, np.array([0, 0, 0, sdf.radius]), 2.0 * sdf.radius)
     if isinstance(sdf, CapsuleSdf):
@@ -42,6 +42,10 @@ def closed_form(sdf: Sdf) -> ConvexPiece | None:
     if isinstance(sdf, CylinderSdf):
         ball = np.array([0, 0, 0, np.hypot(sdf.radius, sdf.half)])
         return ConvexPiece("cylinder", sdf.sizes, ball, 2.0 * min(sdf.radius, sdf.half))
+    if isinstance(sdf, ConeSdf):
+        ball = np.array([0, 0, 0, np.hypot(sdf.radius, sdf.half)])
+        across = 2.0 * sdf.radius / np.hypot(sdf.radius, 2.0 * sdf.half)
+        return ConvexPiece("cone", sdf.sizes, ball, 2.0 * sdf.half * min(1.0, across))
     return None
 
 

@@ -21,7 +21,7 @@ from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, joined, lattice, signed_volume
 from sdfsim.geometry.mesh_io import GLTF, Loaded, load_textured
 from sdfsim.geometry.solidify import solidify
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, PlaneSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, PlaneSdf, SphereSdf, TorusSdf
 from sdfsim.sdf.fit import FIT_VERSION, Recipe
 from sdfsim.sdf.fit.certificate import certify_grid
 from sdfsim.sdf.grid import sample_grid
@@ -55,21 +55,23 @@ _log = logging.getLogger(__name__)
 
 
 def analytic_shape(
-    kind: Literal["plane", "sphere", "capsule", "cylinder", "box"],
+    kind: Literal["plane", "sphere", "capsule", "cylinder", "box", "cone", "torus"],
     *,
     radius: float = 0.0,
     height: float = 0.0,
+    tube: float = 0.0,
     size: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     name: str | None = None,
 ) -> Shape:
     """A shape with an exact SDF, about the origin: "plane" (z = 0, +z outside, infinite), "sphere", "capsule",
-    "cylinder" or "box".
+    "cylinder", "box", "cone" (its tip up, the middle of its height at the origin) or "torus" (around z).
 
-    Radius and height (along z, for a capsule with its caps) are in m, and so is the box's size, its full extents along
-    x, y, z. Mass properties are exact (0 for the plane). The plane is shown as a 20 m square and has no nodes. Raises
-    SdfsimError if a size is missing or not positive.
+    Radius (of a torus that of the circle in the middle of its tube) and height (along z, for a capsule with its caps)
+    are in m, and so are `tube`, the radius of a torus' tube, and the box's size, its full extents along x, y, z. Mass
+    properties are exact (0 for the plane). The plane is shown as a 20 m square and has no nodes. Raises SdfsimError if
+    a size is missing or not positive.
     """
-    volume, inertia, nodes = 0.0, np.zeros((3, 3)), np.zeros((0, 3))
+    volume, com, inertia, nodes = 0.0, np.zeros(3), np.zeros((3, 3)), np.zeros((0, 3))
     if kind == "plane":
         sdf, mesh = PlaneSdf(), primitives.plane(10.0)
     elif kind == "sphere":
@@ -83,6 +85,20 @@ def analytic_shape(
         volume = 8.0 * x * y * z
         inertia = volume / 3.0 * np.diag([y * y + z * z, z * z + x * x, x * x + y * y])
         mesh, nodes = primitives.box((2 * x, 2 * y, 2 * z)), _box_nodes(np.array([x, y, z]))
+    elif kind == "cone":
+        sdf = ConeSdf(float(radius), 0.5 * float(height))
+        volume, com = np.pi * radius**2 * height / 3.0, np.array([0.0, 0.0, -0.25 * height])
+        across = 0.15 * radius**2 + 0.0375 * height**2
+        inertia = volume * np.diag([across, across, 0.3 * radius**2])
+        mesh = primitives.cone(radius, height)
+        outline = np.array([[0.0, -0.5], [0.5, -0.5], [1.0, -0.5], [0.75, -0.25], [0.5, 0.0], [0.25, 0.25], [0.0, 0.5]])
+        nodes = primitives.revolve(outline * (radius, height), 16).vertices
+    elif kind == "torus":
+        sdf = TorusSdf(float(radius), float(tube))
+        volume = 2.0 * np.pi**2 * radius * tube**2
+        across = 0.5 * radius**2 + 0.625 * tube**2
+        inertia = volume * np.diag([across, across, radius**2 + 0.75 * tube**2])
+        mesh, nodes = primitives.torus(radius, tube), primitives.torus(radius, tube, 32, 8).vertices
     else:
         caps = kind == "capsule"
         half = 0.5 * (float(height) - 2.0 * radius * caps)
@@ -90,7 +106,7 @@ def analytic_shape(
         volume, inertia = _round_mass(sdf.radius, half, caps=caps)
         nodes = _round_nodes(sdf.radius, half, caps=caps)
         mesh = convex_hull(_round_nodes(sdf.radius, half, caps=caps, around=48))
-    return Shape(name or kind, mesh, sdf, nodes, float(volume), np.zeros(3), inertia, source={"kind": kind})
+    return Shape(name or kind, mesh, sdf, nodes, float(volume), com, inertia, source={"kind": kind})
 
 
 def _round_mass(radius: float, half: float, *, caps: bool) -> tuple[float, np.ndarray]:

@@ -15,7 +15,7 @@ from sdfsim.shape.shape import Shape
 CONVEX = 1e-3  # relative: how much less volume than its hull a convex mesh may have
 GREY = (180, 180, 185)
 
-PartKind = Literal["box", "sphere", "capsule", "cylinder", "plane", "mesh"]
+PartKind = Literal["box", "sphere", "capsule", "cylinder", "cone", "torus", "plane", "mesh"]
 
 
 @dataclass(frozen=True)

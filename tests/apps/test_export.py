@@ -809,3 +809,23 @@ def test_a_part_of_a_third_of_a_millimetre_loads_in_mujoco_and_falls(tmp_path: P
     assert (1000 * high - data.body("speck").xpos[2]) / 1000 == pytest.approx(9.81 * 0.01**2 / 2, rel=0.12)
     mujoco.mj_step(model, data, 500)
     assert data.body("speck").xpos[2] / 1000 == pytest.approx(size / 2, rel=0.05)
+
+
+def test_cones_and_rings_are_meshes_for_engines(tmp_path: Path) -> None:
+    """As few of them have these forms; a cone is one convex piece."""
+    made = SceneBuilder().add("floor", plane={})
+    made.add("cone", cone={"radius": 0.1, "height": 0.2}, position=(0, 0, 0.2), mass=1.0)
+    made.add("ring", torus={"radius": 0.1, "tube": 0.03}, position=(0.5, 0, 0.2), mass=2.0)
+    files = {suffix: tmp_path / f"out.{suffix}" for suffix in ("xml", "usda", "glb")}
+    for file in files.values():
+        export(made.save(tmp_path / "scene.yaml"), file)
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(files["xml"]))
+    geoms = [model.geom(k) for k in range(model.ngeom)]
+    assert sum(geom.name.startswith("cone") for geom in geoms) == 1
+    assert sum(geom.name.startswith("ring") for geom in geoms) > 4
+    assert model.body("cone").ipos == pytest.approx((0, 0, -0.05), abs=1e-6)
+    assert model.body("ring").inertia.max() == pytest.approx(2.0 * (0.1**2 + 0.75 * 0.03**2), rel=1e-6)
+    assert '"Cone"' not in files["usda"].read_text()
+    assert files["glb"].stat().st_size > 10_000

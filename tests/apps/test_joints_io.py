@@ -18,10 +18,13 @@ from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.play.saved import save_scene
 from sdfsim.apps.recording import ends, marks
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.mesh_io import load_mesh
+from sdfsim.geometry import primitives
+from sdfsim.geometry.mesh import Mesh
+from sdfsim.geometry.mesh_io import load_mesh, wavefront
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.collision_filter import contact_groups
 from sdfsim.scene.scene import Scene
+from sdfsim.sdf.closed_forms import CylinderSdf
 from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
 from sdfsim.simulate.record import at_frame
@@ -928,6 +931,29 @@ def test_a_robot_has_the_looks_of_its_collada_meshes(tmp_path: Path, up: str) ->
     np.testing.assert_allclose((alone.min(0), alone.max(0)), ends[up], atol=1e-9)
     assert shape.volume == pytest.approx(1e-3) and shape.skin is None
     assert (np.abs(np.subtract(scene.bodies[0].color, (255, 128, 0))) < 6).all()
+
+
+def test_a_wheel_that_is_a_mesh_rolls_as_the_cylinder_that_it_is(tmp_path: Path) -> None:
+    """Its axis along y and its middle beside its origin, as wheels are drawn; a hexagonal nut stays a nut."""
+    for name, sides in (("wheel", 24), ("nut", 6)):
+        made = primitives.cylinder(0.1, 0.05, sides)
+        turned = Rotation.from_euler("x", 90, degrees=True).apply(made.vertices) + np.array([0, 0.03, 0])
+        write(tmp_path, f"{name}.obj", wavefront([Mesh(turned, made.faces)]))
+    links = [f'''<link name="{name}"><inertial><origin xyz="0 0.03 0"/><mass value="1"/><inertia ixx="0.003"
+        iyy="0.005" izz="0.003" ixy="0" ixz="0" iyz="0"/></inertial><collision><geometry><mesh filename="{name}.obj"/>
+        </geometry></collision></link>''' for name in ("wheel", "nut")]  # fmt: skip
+    joint = '<joint name="j" type="floating"><parent link="wheel"/><child link="nut"/><origin xyz="0 1 0"/></joint>'
+    scene, report = imported(write(tmp_path, "r.urdf", f'<robot name="r">{"".join(links)}{joint}</robot>'))
+    forms = {body.name: scene.shapes[body.shape].sdf for body in scene.bodies}
+    assert isinstance(forms["wheel"], CylinderSdf) and forms["wheel"].sizes == pytest.approx((0.1, 0.025), rel=1e-6)
+    assert not isinstance(forms["nut"], CylinderSdf)
+    assert "wheel: its mesh is a cylinder up to its facets" in " ".join(report["notes"])
+    wheel = next(body for body in scene.bodies if body.name == "wheel")
+    assert wheel.position == pytest.approx((0, 0.03, 0), abs=1e-9)
+    assert abs(Rotation.from_quat(wheel.quat_xyzw).apply((0, 0, 1)) @ (0, 1, 0)) == pytest.approx(1.0)
+    frame = next(frame for frame in scene.frames if frame.name == "wheel")  # that of the link
+    back = Rotation.from_quat(wheel.quat_xyzw).apply(frame.position) + wheel.position
+    assert back == pytest.approx((0, 0, 0), abs=1e-9)
 
 
 def test_xacro_is_expanded_if_it_is_installed(tmp_path: Path) -> None:

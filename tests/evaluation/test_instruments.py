@@ -17,6 +17,7 @@ from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene, Waypoints
+from sdfsim.sdf.closed_forms import ConeSdf
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.simulator import Simulator
@@ -138,6 +139,15 @@ def test_meshes_are_measured_as_the_closed_forms_that_they_are():
             assert between(*pair, place, turns[0], other=turns[1]).apart[0] == pytest.approx(wanted, abs=3e-5)
         signs.add(bool(wanted > 0))
     assert signs == {True, False}
+
+
+@pytest.mark.parametrize(("radius", "height"), [(0.5, 0.1), (0.1, 0.5), (0.5, 0.5)])
+def test_a_convex_mesh_with_sharp_edges_is_not_entered_from_beyond_them(radius: float, height: float):
+    """Below the rim of a cone its side looks away; the cone itself is known in closed form."""
+    around = np.random.default_rng(0).uniform(-0.8, 0.8, (4000, 3))
+    found = true_surface(mesh(primitives.cone(radius, height, 256))).distance(around)[0]
+    truth = ConeSdf(radius, height / 2)(around)[0]
+    np.testing.assert_allclose(found, truth, atol=2e-4)
 
 
 def test_boxes_are_as_far_apart_as_a_solver_of_quadratic_programs_says():

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from sdfsim.physics.solver.clipping import polygons_room, touching_points
 from sdfsim.physics.solver.convex import Convex, Pair, closest, outermost, simplex_room
 from sdfsim.physics.solver.prepare import _packed
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
 from tests.reference.solids import KINDS, Solid, is_sharp, least_depth, overlap, placed, views, width
 
 BLOCK, BLOCKS, MANY = 500, 6, 200  # pairs of a test; tests of the fast suite, and of both: 3,000 and 100,000 pairs
 GAPS = (0.0, 1e-6, 1e-3, 0.1, 1.0, -1e-6, -1e-3, -1e-2, -3e-2)  # of the smaller thickness
 REACH = 0.015  # of the smaller body: points are told of gaps up to here
-FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf}
+FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf, "cone": ConeSdf}
 
 
 @njit
@@ -54,9 +54,9 @@ class Case(NamedTuple):
         return one, other
 
 
-def drawn_shape(draw: np.random.Generator) -> tuple[str, np.ndarray]:
+def drawn_shape(draw: np.random.Generator, kind: str = "") -> tuple[str, np.ndarray]:
     """A kind and its sizes, or its vertices; aspects up to 1:100."""
-    kind = str(draw.choice(KINDS, p=[0.08, 0.12, 0.3, 0.2, 0.3]))
+    kind = kind or str(draw.choice(KINDS, p=[0.08, 0.12, 0.3, 0.2, 0.3]))
     sizes = 10.0 ** draw.uniform(-2.0, 0.0, 3)
     if kind != "hull":
         return kind, sizes[: {"sphere": 1, "box": 3}.get(kind, 2)]
@@ -75,10 +75,13 @@ def drawn_shape(draw: np.random.Generator) -> tuple[str, np.ndarray]:
     return kind, points * sizes
 
 
-def drawn(seed: int) -> Case:
-    """Touching, near, or a little in each other; at random, aligned, or nearly so."""
+def drawn(seed: int, kind: str = "") -> Case:
+    """Touching, near, or a little in each other; at random, aligned, or nearly so. The first is of a `kind`."""
     draw = np.random.default_rng(seed)
-    (one, other), turns = (drawn_shape(draw), drawn_shape(draw)), Rotation.random(2, random_state=draw).as_matrix()
+    (one, other), turns = (
+        (drawn_shape(draw, kind), drawn_shape(draw)),
+        Rotation.random(2, random_state=draw).as_matrix(),
+    )
     ratio = 10.0 ** draw.uniform(-1.5, 1.5)
     scales = (ratio, 1.0) if draw.random() < 0.5 else (1.0, ratio)
     if draw.random() < 0.6:
@@ -198,10 +201,11 @@ def _square(n: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     "block", [pytest.param(k, marks=[pytest.mark.slow] if k >= BLOCKS else []) for k in range(MANY)]
 )
-def test_no_contact_of_convex_solids_is_missed_or_wrong(block):
+@pytest.mark.parametrize("kind", ["", "cone"])
+def test_no_contact_of_convex_solids_is_missed_or_wrong(block, kind):
     wrong, kinds = [], Counter()
     for seed in range(block * BLOCK, (block + 1) * BLOCK):
-        case = drawn(seed)
+        case = drawn(seed, kind)
         for fault in faults(case):
             wrong.append(f"{seed} {' on '.join(case.kinds)}: {fault}")
             kinds[fault.split(":")[0]] += 1

@@ -20,9 +20,9 @@ class Solid:
     """A core (corners, or two discs) and by how much the solid is larger than it on all sides, in the world."""
 
     kind: str
-    core: np.ndarray  # [V, 3] m, corners; of a cylinder the middles of its ends
-    axis: np.ndarray  # [3], of a cylinder
-    disc: float  # m, radius of a cylinder's ends, else 0
+    core: np.ndarray  # [V, 3] m, corners; of a cylinder the middles of its ends, of a cone that of its end, and its tip
+    axis: np.ndarray  # [3], of a cylinder or cone
+    disc: float  # m, radius of a cylinder's ends or a cone's, else 0
     round: float  # m
     planes: np.ndarray  # [F, 4] outward normals and offsets of flat faces: n.x + d <= 0 inside
     edges: np.ndarray  # [E, 3] unit directions, of a rim some tangents
@@ -31,10 +31,11 @@ class Solid:
 
     def reach(self, along: np.ndarray) -> np.ndarray:
         """[K] how far the core reaches along vectors [K, 3]."""
-        most = (along @ self.core.T).max(1)
+        most = along @ self.core.T
         if self.disc:
-            most += self.disc * np.linalg.norm(np.cross(along, self.axis), axis=1)
-        return most
+            wide = self.disc * np.linalg.norm(np.cross(along, self.axis), axis=1)
+            most[:, : 1 if self.kind == "cone" else 2] += wide[:, None]
+        return most.max(1)
 
     def outside(self, points: np.ndarray) -> np.ndarray:
         """[K] how far points [K, 3] m are from the surface, negative inside; beyond a hull's edge less than that."""
@@ -46,12 +47,27 @@ class Solid:
         if not self.disc:
             share = np.clip((points - low) @ side / square, 0.0, 1.0) if square else np.zeros(len(points))
             return np.linalg.norm(points - low - share[:, None] * side, axis=1) - self.round
+        if self.kind == "cone":
+            return self._beside_cone(points)
         from_middle = points - 0.5 * (low + high)
         up = from_middle @ self.axis
         beside = np.linalg.norm(from_middle - up[:, None] * self.axis, axis=1) - self.disc
         above = np.abs(up) - 0.5 * np.sqrt(square)
         beyond = np.hypot(np.maximum(beside, 0.0), np.maximum(above, 0.0))
         return np.where((beside > 0) | (above > 0), beyond, np.maximum(beside, above))
+
+    def _beside_cone(self, points: np.ndarray) -> np.ndarray:
+        """By the nearest points of the two lines that turn about its axis: those of its disc and its side."""
+        up = (points - self.core[0]) @ self.axis
+        beside = np.linalg.norm(points - self.core[0] - up[:, None] * self.axis, axis=1)
+        tall, place = float((self.core[1] - self.core[0]) @ self.axis), np.stack([beside, up], 1)
+        away = []
+        for start, end in (((0.0, 0.0), (self.disc, 0.0)), ((self.disc, 0.0), (0.0, tall))):
+            line = np.subtract(end, start)
+            share = np.clip((place - start) @ line / (line @ line), 0.0, 1.0)
+            away.append(np.linalg.norm(place - start - share[:, None] * line, axis=1))
+        inside = (up > 0) & (beside / self.disc + up / tall < 1)
+        return np.where(inside, -1.0, 1.0) * np.minimum(*away)
 
     def face(self, along: np.ndarray) -> np.ndarray | None:
         """[K, 3] m, the corners of the flat face whose normal is `along`; None where there is none."""
@@ -62,7 +78,7 @@ class Solid:
         if np.linalg.norm(self.planes[best, :3] - along) > 1e-7:
             return None
         if self.disc:
-            middle = self.core[int((self.core @ along).argmax())]
+            middle = self.core[0 if self.kind == "cone" else int((self.core @ along).argmax())]
             u = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.6 else [0.0, 1.0, 0.0])
             u /= np.linalg.norm(u)
             angle = np.linspace(0.0, 2.0 * np.pi, 256, endpoint=False)[:, None]
@@ -84,6 +100,14 @@ def placed(kind: str, sizes: np.ndarray, turn: np.ndarray, place: np.ndarray, sc
         signs = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1], indexing="ij"), -1).reshape(-1, 3)
         core, thickness, edges = signs * sizes, 2.0 * sizes.min(), np.eye(3)
         normals, offsets = np.concatenate([np.eye(3), -np.eye(3)]), -np.concatenate([sizes, sizes])
+    elif kind == "cone":
+        core, disc = np.outer([-sizes[1], sizes[1]], [0, 0, 1.0]), sizes[0]
+        slant = np.hypot(sizes[0], 2.0 * sizes[1])
+        thickness = 2.0 * sizes[1] * min(1.0, 2.0 * sizes[0] / slant)
+        angle = 2.0 * np.pi * np.arange(2 * RIM) / (2 * RIM)
+        rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(2 * RIM)], 1)
+        sides = (np.array([0, 0, 2.0 * sizes[1]]) - sizes[0] * rim) / slant
+        edges, normals, offsets = np.concatenate([rim[:RIM], sides]), np.array([[0, 0, -1.0]]), np.array([-sizes[1]])
     elif kind == "cylinder":
         core, disc, thickness = np.outer([-sizes[1], sizes[1]], [0, 0, 1.0]), sizes[0], 2.0 * sizes.min()
         angle = np.pi * np.arange(RIM) / RIM
@@ -116,7 +140,10 @@ def width(a: Solid, b: Solid, n: np.ndarray) -> np.ndarray:
 def views(a: Solid, b: Solid) -> tuple[np.ndarray, np.ndarray]:
     """[K, 3] normals, among them those of least depth of flat faces and straight edges, and what each shows [K]."""
     n = [a.planes[:, :3], b.planes[:, :3], np.cross(a.edges[:, None], b.edges[None]).reshape(-1, 3)]
-    n += [_around(solid.axis) for solid in (a, b) if solid.kind in ("capsule", "cylinder")]
+    n += [_around(solid.axis) for solid in (a, b) if solid.kind in ("capsule", "cylinder", "cone")]
+    for solid in (solid for solid in (a, b) if solid.kind == "cone"):
+        tall, out = np.linalg.norm(solid.core[1] - solid.core[0]), _around(solid.axis)
+        n += [tall * way + solid.disc * solid.axis for way in (out, -out)]
     n += [[a.core.mean(0) - b.core.mean(0)], [[0.0, 0.0, 1.0]]]
     n = np.concatenate(n)
     length = np.linalg.norm(n, axis=1)

@@ -72,7 +72,10 @@ TOP = [
     ("limits: {memory_gib: 1}", "limits: unknown key"),
     ("shapes: {cup: {asset: nowhere}}", "shapes.cup.asset: no such folder: FOLDER/nowhere"),
     ("shapes: {cup: {sphere: {}}}", "shapes.cup.sphere.radius: is required"),
-    ("shapes: {cup: {}}", "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, plane, parts is"),
+    (
+        "shapes: {cup: {}}",
+        "shapes.cup: one of asset, mesh, primitive, sphere, capsule, cylinder, box, cone, torus, plane, parts is",
+    ),
     ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: is for mesh only"),
     ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: is not for a plane"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: is for asset, mesh, primitive only"),

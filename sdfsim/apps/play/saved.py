@@ -19,7 +19,7 @@ from sdfsim.scene.builder import SceneBuilder, plain
 from sdfsim.scene.joints import joint_axes
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, CylinderSdf, SphereSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf, TorusSdf
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.looks import is_infinite
 
@@ -73,6 +73,10 @@ def _shape(shape: Shape, folder: Path) -> dict[str, Any]:
             return {"capsule": {"radius": sdf.radius, "height": 2.0 * (sdf.half + sdf.radius)}}
         if isinstance(sdf, CylinderSdf):
             return {"cylinder": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
+        if isinstance(sdf, ConeSdf):
+            return {"cone": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
+        if isinstance(sdf, TorusSdf):
+            return {"torus": {"radius": sdf.radius, "tube": sdf.tube}}
     return {"asset": shape.save(folder).resolve()}
 
 

@@ -11,6 +11,7 @@ from numba.extending import register_jitable
 
 from sdfsim.physics.solver.convex import (
     BLOCK,
+    CONE,
     HULL,
     KIND,
     POINT,
@@ -22,7 +23,7 @@ from sdfsim.physics.solver.convex import (
 )
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
 
-RIM = 24  # points on the circle of a drum's end that bound its contact
+RIM = 24  # points on the circle of the end of a drum or cone that bound its contact
 MOST = 160  # largest number of corners of a clipped face
 CHOSEN = 4  # largest number of them that carry the contact
 STEEP = 0.1  # cosine between a face's normal and the contact's, below which the face does not bound the contact
@@ -100,9 +101,13 @@ def feature(convex, p, size, matrix, body, d, out):
         put(out, 1, turn(matrix, body, (0.0, 0.0, size * b)))
         return 2, d
     x, y = (1.0, 0.0) if across == 0.0 else (local[0] / across, local[1] / across)
-    if abs(local[2]) <= across:
+    top = 0.0 if kind == CONE else a
+    aside = abs(local[2]) <= across
+    if kind == CONE:  # whether its side faces along d, rather than its disc
+        aside = 2.0 * b * across + a * local[2] >= -local[2] * math.sqrt(a * a + 4.0 * b * b)
+    if aside:
         put(out, 0, turn(matrix, body, (size * a * x, size * a * y, -size * b)))
-        put(out, 1, turn(matrix, body, (size * a * x, size * a * y, size * b)))
+        put(out, 1, turn(matrix, body, (size * top * x, size * top * y, size * b)))
         return 2, d
     if across < LEVEL:
         x, y = 1.0, 0.0

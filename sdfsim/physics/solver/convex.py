@@ -30,10 +30,10 @@ from sdfsim.physics.solver.vectors import (
     turn_back,
 )
 
-POINT, SEGMENT, BLOCK, DRUM, HULL = range(5)
+POINT, SEGMENT, BLOCK, DRUM, HULL, CONE = range(6)
 # Columns of the table of convex pieces: kind; sizes (point: radius; segment: radius, half length; block: half extents;
-# drum: radius, half height); a ball around the piece; its thickness, the least distance of two parallel planes around
-# it.
+# drum and cone: radius, half height); a ball around the piece; its thickness, the least distance of two parallel planes
+# around it.
 KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
 
 TOUCHING = 1e-4  # relative to the thickness: nearer solids are moved apart first, as rounding would turn their normals
@@ -119,9 +119,10 @@ def core(convex, p, d):
     if kind == BLOCK:
         return math.copysign(a, d[0]), math.copysign(b, d[1]), math.copysign(c, d[2])
     r = math.sqrt(d[0] * d[0] + d[1] * d[1])
-    if r < 1e-300:
-        return 0.0, 0.0, math.copysign(b, d[2])
-    return a * d[0] / r, a * d[1] / r, math.copysign(b, d[2])
+    if kind == CONE and 2.0 * b * d[2] >= a * r:
+        return 0.0, 0.0, b
+    end = -b if kind == CONE else math.copysign(b, d[2])
+    return (0.0, 0.0, end) if r < 1e-300 else (a * d[0] / r, a * d[1] / r, end)
 
 
 @njit(**INLINED)
@@ -219,7 +220,7 @@ def _squared(convex, matrix, pair, n, s, thick):
     for side in range(2):
         p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
         kind = convex.table[p, KIND]
-        if kind == BLOCK or kind == DRUM:
+        if kind == BLOCK or kind == DRUM or kind == CONE:
             x, y, z = turn_back(matrix, body, n)
             flat = abs(z) > ALONG or (kind == BLOCK and (abs(x) > ALONG or abs(y) > ALONG))
             if flat:
@@ -403,12 +404,12 @@ def _axes(convex, p):
     kind = convex.table[p, KIND]
     if kind == HULL:
         return min(convex.face_start[p + 1] - convex.face_start[p], 64)
-    return 3 if kind == BLOCK or kind == DRUM else 0
+    return 3 if kind == BLOCK or kind == DRUM or kind == CONE else 0
 
 
 @njit(**BARE)
 def _axis(convex, p, e):
-    """The normal of a face; for a drum also two directions across its axis."""
+    """The normal of a face; for a drum or cone also two directions across its axis."""
     if convex.table[p, KIND] == HULL:
         faces = convex.face_start[p + 1] - convex.face_start[p]
         return get(convex.face, convex.face_start[p] + e * max(1, faces // 64))

@@ -15,15 +15,16 @@ from sdfsim.physics.solver.convex import Convex
 from sdfsim.physics.solver.triangles import Triangles, signed
 from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get, norm, put, scale
 
-PLANE, SPHERE, CAPSULE, BOX, CYLINDER, GRID = range(6)
+PLANE, SPHERE, CAPSULE, BOX, CYLINDER, CONE, TORUS, GRID = range(8)
 TINY = 1e-12
 CLOSE = 2.0  # cells: a grid is exact enough farther from the surface
 EVEN = 1e-9  # relative to the size: on an edge of a closed form the first face gives the normal, not rounding
 
 
-# Columns of the table of shapes: kind; sizes (sphere: radius; capsule and cylinder: radius and half height, for a
-# capsule without its caps; box: half extents; else 0); thickness of the thinnest walls; for a grid its first sample,
-# cell size, number of bricks along each side, and where its samples and brick numbers begin.
+# Columns of the table of shapes: kind; sizes (sphere: radius; capsule, cylinder and cone: radius and half height, for a
+# capsule without its caps; torus: radii of its circle and its tube; box: half extents; else 0); thickness of the
+# thinnest walls; for a grid its first sample, cell size, number of bricks along each side, and where its samples and
+# brick numbers begin.
 KIND, SIZE, THICKNESS, LOW, CELL, BRICKS, COARSE, BRICK = 0, 1, 4, 5, 8, 9, 12, 13
 # And for a shape of several patches: the first labelled point, the distance between two, their number along each side,
 # and where the labels begin; -1 if there is one patch only.
@@ -66,7 +67,14 @@ def distance(table, brick, sample, s, p):
         return _ball((p[0], p[1], p[2] - min(max(p[2], -b), b)), a)
     if kind == BOX:
         return _box(p, a, b, c)
-    return _cylinder(p, a, b)
+    if kind == CYLINDER:
+        return _cylinder(p, a, b)
+    r = math.sqrt(p[0] * p[0] + p[1] * p[1])
+    cx, cy = (p[0] / r, p[1] / r) if r > TINY else (1.0, 0.0)
+    if kind == TORUS:
+        return _ball((p[0] - a * cx, p[1] - a * cy, p[2]), b)
+    d, out, up = _cone(r, p[2], a, b)
+    return d, (out * cx, out * cy, up)
 
 
 @njit(**BARE)
@@ -151,6 +159,22 @@ def _cylinder(p, radius, half):
     if x > z - even:
         return x, (cx, cy, 0.0)
     return z, (0.0, 0.0, sz)
+
+
+@njit(**BARE)
+def _cone(r, z, radius, half):
+    """Distance of a point r from the axis, and its slope away from the axis and up."""
+    slant = math.sqrt(radius * radius + 4.0 * half * half)
+    x, z, sine, cosine = r - radius, z + half, radius / slant, 2.0 * half / slant  # from the rim
+    side = cosine * x + sine * z
+    if side <= 0.0 and z >= 0.0:
+        return (side, cosine, sine) if side >= -z else (-z, 0.0, -1.0)
+    along_side = min(max(cosine * z - sine * x, 0.0), slant)
+    dx, dz, ex = x + sine * along_side, z - cosine * along_side, max(x, 0.0)
+    d, e = math.sqrt(dx * dx + dz * dz), math.sqrt(ex * ex + z * z)
+    if e < d:
+        d, dx, dz = e, ex, z
+    return (d, dx / d, dz / d) if d > EVEN * slant else (side, cosine, sine) if side > -z else (-z, 0.0, -1.0)
 
 
 @njit(**INLINED)

@@ -19,12 +19,13 @@ from sdfsim.physics.solver.convex import BALL, Pair, closest, farthest, rounding
 from sdfsim.physics.solver.distance import (
     BOX,
     CAPSULE,
-    CYLINDER,
+    CONE,
     GRID,
     KIND,
     PLANE,
     SIZE,
     SPHERE,
+    TORUS,
     distance_alone,
 )
 from sdfsim.physics.solver.manifold import (
@@ -38,9 +39,13 @@ from sdfsim.physics.solver.manifold import (
 )
 from sdfsim.physics.solver.references import call, reference
 from sdfsim.physics.solver.surface_distance import (
+    BEADS,
     KEYS,
     at_least,
     beyond,
+    core_point,
+    core_radius,
+    has_core,
     is_round,
     looked_at,
     map_between,
@@ -133,14 +138,13 @@ def find_near(shapes, world, work, motion, rules, span, old, pieces):
 def pair_kind(shapes, s, t):
     """The way in which two shapes are tested."""
     table, start = shapes.table, shapes.solids.start
-    one, other = is_round(table, s), is_round(table, t)
+    one, other = has_core(table, s), has_core(table, t)
     first, second = start[s + 1] > start[s], start[t + 1] > start[t]
     if one or other:
         if table[s, KIND] != GRID and table[t, KIND] != GRID:
             long = table[s, KIND] == CAPSULE or table[t, KIND] == CAPSULE
-            edged = table[s, KIND] == BOX or table[s, KIND] == CYLINDER
-            edged = edged or table[t, KIND] == BOX or table[t, KIND] == CYLINDER
-            return SOLIDS if long and edged else ROUND  # a line may lie along a face; else points on a core are enough
+            # A line may lie along a face; else points on a core are enough.
+            return SOLIDS if long and (BOX <= table[s, KIND] <= CONE or BOX <= table[t, KIND] <= CONE) else ROUND
         return SOLIDS if first and second else SURFACES
     return SOLIDS if (first or table[s, KIND] == PLANE) and (second or table[t, KIND] == PLANE) else SURFACES
 
@@ -225,7 +229,7 @@ def _near(shapes, world, motion, matrix, pairs, ways, reach, near, p, surfaces):
         return
     if way == ROUND:
         # One query says whether the ball around either may touch the other; 1 means yes.
-        one = a if is_round(shapes.table, world.shape[a]) else b
+        one = a if has_core(shapes.table, world.shape[a]) else b
         other = b if one == a else a
         w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
         k = world.scale[other]
@@ -541,12 +545,17 @@ def _write_points(world, matrix, pair, n, picked, arm, key, polygons, found, cou
 
 @njit(**INLINED)
 def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
-    """The manifold of a pair with a sphere or a capsule."""
+    """The manifold of a pair with a sphere, a capsule or a torus."""
     a, b = manifolds.pair[p, 0], manifolds.pair[p, 1]
     first, second = shapes.table[world.shape[a], KIND], shapes.table[world.shape[b], KIND]
-    one, other = is_round(shapes.table, world.shape[a]), is_round(shapes.table, world.shape[b])
+    one, other = has_core(shapes.table, world.shape[a]), has_core(shapes.table, world.shape[b])
     known, found, point = manifolds.count[p], scratch.found, manifolds.point
     reach = rules.contact_margin + _approach_margin(world, motion, rules, a, b)
+    if first == TORUS or second == TORUS:
+        side = 0 if first == TORUS else 1
+        count = round_points(shapes, world, motion, matrix, reach, a, b, side, found)
+        manifolds.count[p] = renewed(rules, point, p, known, scratch, count)
+        return
     count = round_points(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found)
     if count == 1 and first == SPHERE and second == SPHERE:
         for x in range(COLUMNS):
@@ -600,12 +609,13 @@ def nearest(shapes, shape, place, frame, scales, coms, pairs, near, p, went, lea
         return least
     for side in range(2):
         s, t = shape[pairs[p, side]], shape[pairs[p, 1 - side]]
-        if is_round(table, s) and way == ROUND:
+        if has_core(table, s) and way == ROUND:
             w, c = map_between(place, frame, scales, coms, side, 1 - side)
-            k, half = scales[1 - side], table[s, SIZE + 1] if table[s, KIND] == CAPSULE else 0.0
-            for e in range(-2, 3):
-                d = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, 0.5 * e * half)))
-                least = min(least, k * d - scales[side] * table[s, SIZE])
+            more = 0 if table[s, KIND] == SPHERE else (BEADS if table[s, KIND] == TORUS else 4)
+            for e in range(more + 1):
+                at = core_point(table, s, 2.0 * e / max(more, 1) - 1.0)
+                d = distance_alone(table, brick, sample, t, mapped(w, c, at))
+                least = min(least, scales[1 - side] * d - scales[side] * core_radius(table, s))
             if refresh and least <= 0.0:
                 return math.inf
         elif surfaces is not None:

@@ -21,7 +21,7 @@ from sdfsim.physics.motion import MOTION, Motion
 from sdfsim.physics.options import SLOP, SLOP_A_TIME, SLOW, Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
-from sdfsim.physics.solver.convex import BALL, BLOCK, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
+from sdfsim.physics.solver.convex import BALL, BLOCK, CONE, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
 from sdfsim.physics.solver.edges import nodes_within, points_within
 from sdfsim.physics.solver.joints import Each, Joints, Trial
 from sdfsim.physics.solver.manifold import scratch_room
@@ -36,16 +36,16 @@ from sdfsim.physics.solver.triangles import Triangles, signed_distances
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
 from sdfsim.physics.validity import NO_LIMITS, fault_of
 from sdfsim.sdf.baked_grid import BakedGrid, interpolated
-from sdfsim.sdf.closed_forms import ClosedForm
+from sdfsim.sdf.closed_forms import ClosedForm, PlaneSdf
 from sdfsim.shape.contact_geometry import NO_SURFACE, ContactGeometry, ContactSurface
 from sdfsim.shape.convex_pieces import ConvexPiece
 from sdfsim.shape.triangle_tree import TriangleTree
 
 FORMS = {
     "plane": kinds.PLANE, "sphere": kinds.SPHERE, "capsule": kinds.CAPSULE, "box": kinds.BOX,
-    "cylinder": kinds.CYLINDER,
+    "cylinder": kinds.CYLINDER, "cone": kinds.CONE, "torus": kinds.TORUS,
 }  # fmt: skip
-SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "hull": HULL}
+SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "cone": CONE, "hull": HULL}
 CROWD = 64  # number of dynamic bodies from which threads may test pairs
 TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
 SIDED, AGREED = 4000, 0.98  # places at which triangles and grid are compared, and the part that must be on one side
@@ -383,9 +383,9 @@ def _manifolds(touch: Touch | None) -> compiled.Manifolds:
 
 
 def meet_as_surfaces(shapes: Sequence[ContactGeometry]) -> bool:
-    """Whether any of the shapes collides as a surface. Shapes that are convex, or made of convex pieces, collide as
-    solids."""
-    return any(not (isinstance(shape.sdf, ClosedForm) or shape.solids) for shape in shapes)
+    """Whether any of the shapes collides as a surface. Planes, shapes that are convex, and those made of convex pieces
+    collide as solids."""
+    return any(not (isinstance(shape.sdf, PlaneSdf) or shape.solids) for shape in shapes)
 
 
 def compiled_shapes(shapes: Sequence[ContactGeometry], *, grids: bool = True) -> kinds.Shapes:

@@ -17,6 +17,7 @@ from sdfsim.physics.solver.distance import (
     PLANE,
     SIZE,
     SPHERE,
+    TORUS,
     distance,
     distance_alone,
     patch_of,
@@ -55,6 +56,9 @@ LONGER = 4.0  # a step is at most this many times the last one
 SHARPER, SHARPEST = 4, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
 WITHIN = 0.5  # cells: how far the refinement on a grid may end from where triangles are nearest
 AWAY, TRACED = 1e-6, 12  # model lengths: farther points do not touch yet; and steps of a search along their way
+BEADS, FIXED = 32, 8  # points on a core at which distances are taken; and those of a whole circle that touch
+GOLDEN = 0.6180339887498949
+LEVEL = 1e-9  # relative to a circle's radius: differences of distance that show no nearest point
 SHORTEST, AHEAD = 2.5, 4.0  # first step when starting again: least multiples of the last, and of the motion since
 
 
@@ -89,6 +93,25 @@ def mapped(w, c, p):
 def is_round(table, s):
     """Whether a shape consists of all points within a radius of a line or point."""
     return table[s, KIND] == SPHERE or table[s, KIND] == CAPSULE
+
+
+@njit(**BARE)
+def has_core(table, s):
+    """Whether a shape consists of all points within a radius of a point, a line or a circle."""
+    return is_round(table, s) or table[s, KIND] == TORUS
+
+
+@njit(**BARE)
+def core_radius(table, s):
+    return table[s, SIZE + 1] if table[s, KIND] == TORUS else table[s, SIZE]
+
+
+@njit(**BARE)
+def core_point(table, s, part):
+    """A point of the core, from one end (-1) to the other (1), or around the circle."""
+    if table[s, KIND] == TORUS:
+        return table[s, SIZE] * math.cos(math.pi * part), table[s, SIZE] * math.sin(math.pi * part), 0.0
+    return 0.0, 0.0, part * table[s, SIZE + 1]
 
 
 @njit(**INLINED)
@@ -448,36 +471,60 @@ def _travel(world, motion, matrix, rules, point, one, other, mine, theirs):
 
 @njit(**BARE)
 def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
-    """A sphere or capsule against anything: the distance at its core, less its radius."""
+    """A sphere, capsule or torus against anything: the distance at points of its core, less its radius."""
     table, brick, sample = shapes.table, shapes.brick, shapes.sample
     one, other = (a, b) if side == 0 else (b, a)
     s, t = world.shape[one], world.shape[other]
     w, c = map_between(motion.position, matrix, world.scale, world.com, one, other)
-    k, own = world.scale[other], world.scale[one]
-    radius = shapes.table[s, SIZE]
-    tried = 1
-    half = 0.0
-    heights = (0.0, 0.0, 0.0)
-    if shapes.table[s, KIND] == CAPSULE:
-        half = shapes.table[s, SIZE + 1]
-        tried = 3
-        between = half if shapes.table[t, KIND] == PLANE else _lowest(table, brick, sample, t, w, c, half)
-        heights = (-half, half, between)
-    count = 0
-    for e in range(tried):
-        if e == 2 and half - abs(heights[2]) < 0.05 * half:
-            continue
-        core = (0.0, 0.0, heights[e])
-        d, n = distance(table, brick, sample, t, mapped(w, c, core))
-        gap = k * d - own * radius
-        if gap > reach:
-            continue
-        mine = turn_back(matrix, one, turn(matrix, other, scale(n, -own * radius)))
-        mine = sub(add(scale(core, own), mine), get(world.com, one))
-        theirs = sub(along(scale(mapped(w, c, core), k), n, -k * d), get(world.com, other))
-        write(found, count, side, mine, theirs, turn(matrix, other, n), gap, 0)
-        count += 1
+    if table[s, KIND] == TORUS:
+        return _ring_points(shapes, world, matrix, reach, one, other, w, c, side, found)
+    count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, 0, -1.0)
+    if table[s, KIND] == CAPSULE:
+        count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, 1.0)
+        between = 1.0 if table[t, KIND] == PLANE else _lowest(table, brick, sample, s, t, w, c, -1.0, 1.0)
+        if abs(between) <= 0.95:
+            count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, between)
     return count
+
+
+@njit(**BARE)
+def _ring_points(shapes, world, matrix, reach, one, other, w, c, side, found):
+    """`round_points` for a torus: the points of its circle at which the distance is least, and if all of the circle is
+    near, as of a ring that lies on a table, also some that do not change."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    s, t, count, kept = world.shape[one], world.shape[other], 0, FOUND - BEADS
+    low, high = math.inf, -math.inf
+    for e in range(BEADS):
+        d = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, 2.0 * e / BEADS - 1.0)))
+        found[kept + e, GAP], low, high = d, min(low, d), max(high, d)
+    near = (reach + world.scale[one] * core_radius(table, s)) / world.scale[other]
+    level, near_all = high - low <= LEVEL * table[s, SIZE], high <= near
+    step = math.pi * table[s, SIZE] * world.scale[one] / world.scale[other] * 2.0 / BEADS
+    for e in range(BEADS):
+        d, part = found[kept + e, GAP], 2.0 * e / BEADS - 1.0
+        if near_all and e % (BEADS // FIXED) == 0:
+            count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, part)
+        before, after = found[kept + (e - 1) % BEADS, GAP], found[kept + (e + 1) % BEADS, GAP]
+        if not level and d <= near + step and d <= before and d < after:
+            least = _lowest(table, brick, sample, s, t, w, c, part - 2.0 / BEADS, part + 2.0 / BEADS)
+            count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, least)
+    return count
+
+
+@njit(**BARE)
+def _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, part):
+    """Write the point that belongs to one of the core, if it is near. Returns the number of points."""
+    s, t, k, own = world.shape[one], world.shape[other], world.scale[other], world.scale[one]
+    core, radius = core_point(shapes.table, s, part), own * core_radius(shapes.table, s)
+    d, n = distance(shapes.table, shapes.brick, shapes.sample, t, mapped(w, c, core))
+    gap = k * d - radius
+    if gap > reach:
+        return count
+    mine = turn_back(matrix, one, turn(matrix, other, scale(n, -radius)))
+    mine = sub(add(scale(core, own), mine), get(world.com, one))
+    theirs = sub(along(scale(mapped(w, c, core), k), n, -k * d), get(world.com, other))
+    write(found, count, side, mine, theirs, turn(matrix, other, n), gap, 0)
+    return count + 1
 
 
 @njit(**BARE)
@@ -497,21 +544,20 @@ def beyond(shapes, t, w, c, k, own, e):
 
 
 @njit(**BARE)
-def _lowest(table, brick, sample, t, w, c, half):
-    """The point of a capsule's axis, between -half and half, that is nearest to shape t, by golden section search."""
-    low, high = -half, half
-    one, other = high - 0.6180339887498949 * (high - low), low + 0.6180339887498949 * (high - low)
-    f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
-    g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+def _lowest(table, brick, sample, s, t, w, c, low, high):
+    """The part of a core, between two, that is nearest to shape t, by golden section search."""
+    one, other = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+    f = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, one)))
+    g = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, other)))
     for _ in range(30):
         if f <= g:
             high, other, g = other, one, f
-            one = high - 0.6180339887498949 * (high - low)
-            f = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, one)))
+            one = high - GOLDEN * (high - low)
+            f = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, one)))
         else:
             low, one, f = one, other, g
-            other = low + 0.6180339887498949 * (high - low)
-            g = distance_alone(table, brick, sample, t, mapped(w, c, (0.0, 0.0, other)))
+            other = low + GOLDEN * (high - low)
+            g = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, other)))
     return 0.5 * (low + high)
 
 
