@@ -311,4 +311,151 @@ def links(at: Setting) -> Iterator[Check]:
     yield ran.between("speed of the end", np.abs(ran.rollout.velocity[:, -1]).max(), 1.0, 100.0, "m/s")
 
 
-ASSEMBLY = (pegs, rims, rollers, gears, nuts, bearings, bricks, links)
+CUTS = (1.2e-3, 1.8e-3, 0.9e-3, 1.5e-3)  # m: heights of a key's cuts
+# m: radius of a lock's bore, half of the width of the grooves above and below, and how deep plates drop into them
+BORE, GROOVE, DROP = 6.1e-3, 2.5e-3, 2e-3
+
+
+def rays(center: tuple[float, float], corners: np.ndarray, count: int) -> np.ndarray:
+    """[K] rad, angles around a centre: `count` even ones, and those of corners [C, 2] m."""
+    even = 2 * pi * np.arange(count) / count - pi
+    return np.unique(np.concatenate([even, np.arctan2(*(corners - center).T[::-1])]).round(9))
+
+
+def blade(profile: np.ndarray) -> Mesh:
+    """A key 2 mm thick along z, from 2 mm below its axis up to a profile [K, 2] (z, height) m."""
+    z, high = profile.T
+    low = np.full_like(z, -2e-3)
+    rings = np.stack(
+        [
+            np.column_stack([np.full_like(z, x), y, z])
+            for x, y in ((-1e-3, low), (1e-3, low), (1e-3, high), (-1e-3, high))
+        ],
+        1,
+    )
+    at = (
+        4 * np.arange(len(z) - 1)[:, None] + np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])[:, None]
+    )
+    last = 4 * len(z) - 4
+    quads = np.concatenate([at.reshape(-1, 4), [[3, 2, 1, 0], [last, last + 1, last + 2, last + 3]]])
+    return clean(Mesh(rings.reshape(-1, 3), np.concatenate([quads[:, :3], quads[:, [0, 2, 3]]])))
+
+
+def lock(mesh: Files, key: tuple[float, ...], **keys: Any) -> SceneBuilder:
+    """A lock with four plates in gaps of its plug, which the cuts of a key lift out of the grooves of the housing; and
+    a key in it, with further `keys` of its body."""
+    built = SceneBuilder(gravity=(0, -G, 0))
+    side = np.sqrt(BORE**2 - GROOVE**2)
+    turn = np.linspace(-np.arctan2(side, GROOVE), np.arctan2(side, GROOVE), 24)
+    half = np.concatenate(
+        [BORE * np.stack([np.cos(turn), np.sin(turn)], 1), [(GROOVE, 5.4e-3 + DROP), (-GROOVE, 5.4e-3 + DROP)]]
+    )
+    inner = np.concatenate([half, -half])
+    outer = 10e-3 * inner / np.linalg.norm(inner, axis=1)[:, None]
+    hole, middle = np.array([(1.1e-3, 3e-3), (-1.1e-3, 3e-3), (-1.1e-3, -2.2e-3), (1.1e-3, -2.2e-3)]), (0.0, 0.4e-3)
+    angle = rays(middle, hole, 64)
+    way = np.stack([np.cos(angle), np.sin(angle)], 1)
+    with np.errstate(divide="ignore"):
+        slot = np.array(middle) + way * np.minimum(1.1e-3 / np.abs(way[:, :1]), 2.6e-3 / np.abs(way[:, 1:]))
+    slice_ = sleeve(6e-3 * slot / np.linalg.norm(slot, axis=1)[:, None], slot, 1.2e-3)
+    plug = joined([Mesh(slice_.vertices + np.array([0, 0, 2.2e-3 * k]), slice_.faces) for k in range(5)])
+    top = [
+        (z + dz, high)
+        for z, high in zip(2.2e-3 * np.arange(4) + 1.1e-3, key, strict=True)
+        for dz in (-0.55e-3, 0.55e-3)
+    ]
+    profile = np.array([(-3e-3, key[0]), *top, (top[-1][0] + key[-1] + 1.8e-3, -1.8e-3)])
+    square = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
+    steel = {"friction": 0.3, "restitution": 0}
+    built.add("housing", mesh=mesh("housing", sleeve(outer, inner, 20e-3)), motion="static", **steel)
+    built.add("plug", mesh=mesh("plug", plug), density=7850, **steel)
+    built.join("axle", "hinge", "plug", axis=(0, 0, 1), anchor=(0, 0, 0))
+    built.add(
+        "key",
+        mesh=mesh("key", blade(profile)),
+        collides_with=["plug", *(f"plate{k}" for k in range(4))],
+        **steel | keys,
+    )
+    for k, (cut, high) in enumerate(zip(CUTS, key, strict=True)):
+        window = np.array([(1.1e-3, cut), (-1.1e-3, cut), (-1.1e-3, -3.4e-3), (1.1e-3, -3.4e-3)])
+        plate = mesh(f"plate{k}", sleeve(square * (2.3e-3, 5.4e-3), window, 0.8e-3))
+        lift = 2e-5 + (-DROP if "path" in keys else high - cut)
+        built.add(f"plate{k}", mesh=plate, position=(0, lift, 2.2e-3 * k + 1.1e-3), density=7850, **steel)
+    return built
+
+
+def keys(at: Setting) -> Iterator[Check]:
+    """A key that is pushed into a lock lifts its plates to where they clear the housing; it turns the plug then, and
+    another key does not."""
+    path = [{"time": 0, "position": (0, 0, -14e-3)}, {"time": 1.0, "position": (0, 0, 0)}]
+    with TemporaryDirectory() as folder:
+        ran = run_built(at, "pushed in", lock(Files(folder), CUTS, motion="kinematic", path=path), 1.05)
+    lifted = np.ptp(ran.rollout.position[[0, -1], 3:, 1], axis=0)
+    yield ran.most("plates too high or low", np.abs(lifted - DROP).max(), 1e-4, "m")
+    for name, cuts in (("its own key", CUTS), ("another key", CUTS[::-1])):
+        with TemporaryDirectory() as folder:
+            built = lock(Files(folder), cuts)
+            motor = {"speed": 3.0, "max_force": 0.02}
+            built.join("hand", "hinge", "key", axis=(0, 0, 1), anchor=(0, 0, 0), motor=motor)
+            ran = run_built(at, name, built, 0.5)
+        turned = spun(ran, "plug")[-1]
+        yield ran.between("turns the plug", turned, *((1.3, 1.6) if cuts == CUTS else (-0.02, 0.2)), "rad")
+
+
+# The six sticks of a burr puzzle, two along each axis, in cells; and which of them has each cell that several cross.
+STICKS = [[(-3, 3), (-1, 1), (low, low + 2)] for low in (0, -2)]
+STICKS += [[(low, low + 2), (-3, 3), (-1, 1)] for low in (0, -2)] + [
+    [(-1, 1), (low, low + 2), (-3, 3)] for low in (0, -2)
+]
+OWNERS = "30305555001300335515001100442020"
+
+
+def blocks(cells: np.ndarray, size: float, gap: float) -> Mesh:
+    """The surface of cubes [K, 3] of `size` m, drawn in by `gap` m."""
+    known = set(map(tuple, cells.tolist()))
+    corners, normals = [], []
+    for axis in range(3):
+        for side in (0, 1):
+            out = np.eye(3, dtype=int)[axis] * (2 * side - 1)
+            bare = np.array([cell for cell in known if tuple(np.add(cell, out).tolist()) not in known])
+            one, two = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+            square = np.array([0 * one, one, one + two, two][:: 2 * side - 1]) + side * np.eye(3, dtype=int)[axis]
+            corners.append(bare[:, None] + square)
+            normals.append(np.broadcast_to(out, corners[-1].shape))
+    place, index = np.unique(np.concatenate(corners).reshape(-1, 3), axis=0, return_inverse=True)
+    drawn = np.zeros((2, *place.shape))
+    for way, name in ((np.maximum, 1), (np.minimum, 0)):
+        way.at(drawn[name], index.reshape(-1), np.concatenate(normals).reshape(-1, 3))
+    quads = index.reshape(-1, 4)
+    return clean(Mesh(size * place - gap * drawn.sum(0), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])))
+
+
+def puzzles(at: Setting) -> Iterator[Check]:
+    """A burr puzzle of six sticks of 20 x 20 x 60 mm with a fifth of a millimetre of play, one of them held: whichever
+    way gravity pulls, the key slides out along its axis only, and no other stick comes off."""
+    size, gap = 10e-3, 1e-4
+    cells = np.array([*np.ndindex(6, 6, 6)]) - 3
+    inside = np.array(
+        [
+            np.all([(cells[:, a] >= low) & (cells[:, a] < high) for a, (low, high) in enumerate(stick)], 0)
+            for stick in STICKS
+        ]
+    )
+    shared = iter(OWNERS)
+    owner = [int(next(shared)) if sum(who) > 1 else int(np.argmax(who)) if any(who) else -1 for who in inside.T]
+    meshes = [blocks(cells[np.array(owner) == k], size, gap) for k in range(6)]
+    for way in ([1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0, 1, 1]):
+        built = SceneBuilder(gravity=(G * np.array(way) / np.linalg.norm(way)).tolist())
+        with TemporaryDirectory() as folder:
+            mesh = Files(folder)
+            for k, one in enumerate(meshes):
+                keys: dict[str, Any] = {"motion": "static"} if k == 1 else {"mass": 0.02}
+                built.add(f"stick{k}", mesh=mesh(f"stick{k}", one), friction=0.5, restitution=0, **keys)
+            ran = run_built(at, f"towards {way}", built, 0.3)
+        moved = np.linalg.norm(ran.rollout.position - ran.rollout.position[0], axis=2).max(0)
+        if way[0]:
+            yield ran.near("key slides out", ran.rollout.position[-1, 0, 0], 0.5 * G * 0.3**2, 0.02, "m")
+        yield ran.most("others move", moved[1 if way[0] else 0 :].max(), 20 * gap, "m")
+
+
+ASSEMBLY = (pegs, rims, rollers, gears, nuts, bearings, bricks, links, puzzles, keys)
