@@ -14,7 +14,7 @@ from tests.helpers.everyday import COUNTS, MISSED
 
 SLOW = {
     "slender", "heaps", "seams", "rolling", "facets", "round_on_meshes", "flat_drops", "slabs", "spins", "bullets",
-    "chains", "rollers", "nuts", "bearings", "links",
+    "chains", "rollers", "nuts", "bearings", "links", "keys", "puzzles",
 }  # fmt: skip
 FAST_GROUPS = ("overlap", "thin")  # of hard cases
 # Three sizes and orientations, and what solids are made of.

@@ -15,6 +15,7 @@ from sdfsim.apps.film.drawing import Look
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.frames import Clip, read_clip
 from sdfsim.apps.film.recording import recording_of
+from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
 from sdfsim.apps.identify.filmed import identify_films
 from sdfsim.apps.identify.report import Identified
@@ -36,9 +37,10 @@ def track(
 ) -> Recording:  # fmt: skip
     """Where the moving bodies of a scene were in a film of a fixed camera, with an uncertainty of each pose.
 
-    The camera is found from `points` of known places (a YAML file, see docs/identify.md), or from a single ball that
-    bounces on level ground. `slow`: how many times slower the film plays than things moved; `start` and `end` s: the
-    part of the film. Raises SdfsimError for films in which the bodies cannot be tracked.
+    The camera is found from `points` of known places (a YAML file, see docs/identify.md), from the photos of a scene
+    that `sdfsim reconstruct` made, or from a single ball that bounces on level ground. `slow`: how many times slower
+    the film plays than things moved; `start` and `end` s: the part of the film. Raises SdfsimError for films in which
+    the bodies cannot be tracked.
     """
     return watched(
         Path(clip), loaded(scene), points=points, slow=slow, start=start, end=end, on_progress=on_progress
@@ -55,14 +57,18 @@ def watched(
     checked(clip, back)
     bodies, size = movers(scene), (clip.pixels.shape[2], clip.pixels.shape[1])
     looks = [Look(scene, body) for body in bodies]
+    room = photos_of(scene.path)
     if points is not None:
         pixels, places, focal = read_points(Path(points))
         eye = of_points(pixels / clip.smaller, places, focal and focal / clip.smaller, size, str(points))
+    elif room is not None:
+        still = np.median(clip.pixels[:: max(1, len(clip.time) // 15)], 0).astype(np.uint8)
+        eye = of_points(*of_room(still, room, str(path)), None, size, f"the photos of {room}")
     elif len(looks) == 1 and looks[0].ball:
         eye = level(clip)
     else:
         raise SdfsimError(
-            f"{path}: where the camera stood is not known (only a single ball shows it by falling)",
+            f"{path}: where the camera stood is not known (a single ball shows it, and photos of a room do)",
             "give points of known places: --points points.yaml (docs/identify.md)",
         )
     shutter, tracks, gravity = Shutter(0.5 * clip.step, 0.7), [], np.asarray(scene.gravity)
@@ -85,7 +91,7 @@ def watched(
     for body, one in zip(bodies, tracks, strict=True):
         _judged(clip, one, body.name)
         _stays(clip, eye, one, body.name)
-    if points is None:
+    if points is None and room is None:
         look = looks[0]
         below = [
             b.position[2] + b.scale * scene.shapes[b.shape].sdf.bounds[1, 2]
