@@ -13,7 +13,8 @@ from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.base.errors import SdfsimError
 
 SIZE = 320, 240
-# From the reconstruction's axes and units to metres.
+# From the reconstruction's axes and units to metres, with a step between.
+UNIT = {"scale": 0.25, "rotation": np.eye(3)[[1, 2, 0]].tolist(), "translation": [0.1, -0.2, 0.3]}
 SCALE, TURN, SHIFT = 0.7, Rotation.from_euler("xyz", [30, -50, 80], degrees=True).as_matrix(), np.array([0.3, -1, 2])
 
 
@@ -63,7 +64,7 @@ def room(tmp_path_factory) -> Path:
     import cv2
 
     folder = tmp_path_factory.mktemp("room")
-    for name in ("poses", "mesh", "photos/images"):
+    for name in ("poses", "mesh", "distill", "photos/images"):
         (folder / name).mkdir(parents=True)
     (folder / "scene.yaml").write_text("version: 1\n")
     views, places = [], []
@@ -84,7 +85,10 @@ def room(tmp_path_factory) -> Path:
         folder / "poses/sparse.npz", xyz=xyz, point_of=np.tile(every, 6), view_of=np.repeat(np.arange(6), len(xyz))
     )
     (folder / "poses/cameras.json").write_text(json.dumps({"views": views}))
-    way = {"scale": SCALE, "rotation": TURN.tolist(), "translation": SHIFT.tolist()}
+    (folder / "distill/field.json").write_text(json.dumps({"to_unit": UNIT}))
+    turn, scale = TURN @ np.array(UNIT["rotation"]).T, SCALE / UNIT["scale"]
+    shift = SHIFT - scale * turn @ UNIT["translation"]
+    way = {"scale": scale, "rotation": turn.tolist(), "translation": shift.tolist()}
     (folder / "mesh/placement.json").write_text(json.dumps({"to_metres": way}))
     return folder
 

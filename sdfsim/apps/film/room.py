@@ -20,7 +20,7 @@ FEATURES = 4000  # of a picture
 def photos_of(scene: Path | None) -> Path | None:
     """The folder of `sdfsim reconstruct` that a scene file lies in, if it has the photos still."""
     folder = scene.parent if scene is not None else None
-    needed = ("poses/cameras.json", "poses/sparse.npz", "mesh/placement.json", "photos/images")
+    needed = ("poses/cameras.json", "poses/sparse.npz", "distill/field.json", "mesh/placement.json", "photos/images")
     return folder if folder is not None and all((folder / name).exists() for name in needed) else None
 
 
@@ -68,10 +68,11 @@ def _known(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     from scipy.spatial import KDTree
 
     sparse = read_arrays(folder / "poses/sparse.npz", "points of a room")
-    views = read_json(folder / "poses/cameras.json", "run the poses stage again")["views"]
-    way = read_json(folder / "mesh/placement.json", "run the mesh stage again")["to_metres"]
-    xyz = np.asarray(sparse["xyz"])
-    places = way["scale"] * xyz @ np.array(way["rotation"]).T + way["translation"]
+    views = read_json(folder / "poses/cameras.json", "reconstruct the room again")["views"]
+    places = xyz = np.asarray(sparse["xyz"])
+    for file, key in (("distill/field.json", "to_unit"), ("mesh/placement.json", "to_metres")):
+        way = read_json(folder / file, "reconstruct the room again")[key]
+        places = way["scale"] * places @ np.array(way["rotation"]).T + way["translation"]
     points, words = [np.zeros(0, np.int64)], [np.zeros((0, 128), np.float32)]
     for k, view in enumerate(views):
         grey = cv2.imread(str(folder / "photos/images" / view["name"]), cv2.IMREAD_GRAYSCALE)

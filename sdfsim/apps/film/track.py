@@ -26,6 +26,7 @@ GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is los
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
 FAR = 6  # frames for which a lost body is looked for where it would fly
 TWIN = 0.85  # score of each of two things that may both be the body
+OTHER = 60.0  # levels by which a ball's colour never differs from that in other frames
 SHUTTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the time between frames
 SPREADS = (0.0, 0.6, 1.0, 1.6)  # px
 
@@ -66,9 +67,12 @@ def frame_of(clip: Clip, back: Background, k: int, hidden: np.ndarray | None = N
     return Frame(clip.pixels[k], (back.pixels, back.first, back.last)[way], float(back.gain[k]), back.noise, hidden)
 
 
-def blobs(frame: Frame) -> list[tuple[np.ndarray, float]]:
-    """What differs from the background, largest first: centres [2] px and areas px^2."""
-    off = np.nan_to_num(np.abs(frame.pixels - np.float32(frame.gain) * frame.still)).max(-1)
+def blobs(frame: Frame, others: Sequence[np.ndarray] = ()) -> list[tuple[np.ndarray, float]]:
+    """What differs from the background, and from `others`, largest first: centres [2] px and areas px^2."""
+    off = np.full(frame.pixels.shape[:2], np.inf)
+    for still in (frame.still, *others):
+        off = np.fmin(off, np.abs(frame.pixels - np.float32(frame.gain) * still).max(-1))
+    off[np.isinf(off)] = 0.0
     moves = (cv2.GaussianBlur(off, (0, 0), 1.0) > FOREGROUND * frame.noise).astype(np.uint8)
     moves = cv2.morphologyEx(moves, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     _, _, stats, centres = cv2.connectedComponentsWithStats(moves)
@@ -101,7 +105,8 @@ def find(
     none, found = np.zeros(2), []
     for k in np.unique(np.linspace(0, len(clip.time) - 1, STARTS + 2)[1:-1].astype(int)).tolist():
         frame = frame_of(clip, back, k)
-        for blob in blobs(frame):
+        # A place where the body rests for long, before or after, differs from the median when it is free.
+        for blob in blobs(frame, (back.first, back.last)):
             tried = []
             for guess in guesses(look, eye, blob, place, turns):
                 rough = fitted(look, eye, frame, *guess, none, 0.7, None, rounds=6, wide=2.5)
@@ -166,7 +171,7 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
             for guess in guesses(look, eye, blob, first.place, [first.turn]):
                 one = fitted(look, eye, frame, *guess, np.zeros(2), shutter.spread, first.color, wide=2.5)
                 one = one and fitted(look, eye, frame, one.place, one.turn, np.zeros(2), shutter.spread, first.color)
-                if one is not None and one.score > GOOD:
+                if one is not None and one.score > GOOD and not _repainted(look, one, first):
                     return one
         return None
     best = None
@@ -183,11 +188,16 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide)
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
-        if one is not None and (best is None or one.score > best.score):
+        if one is not None and (best is None or one.score > best.score) and not _repainted(look, one, first):
             best = one
     if best is None or best.score < POOR or at_edge(look, eye, best.place, best.turn):
         return None
     return best
+
+
+def _repainted(look: Look, one: Seen, first: Seen) -> bool:
+    """Whether what looks like a ball has another colour than it: a place that it left, seen before the background."""
+    return bool(look.ball) and float(np.abs(one.color[0] - first.color[0]).max()) > OTHER
 
 
 def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
