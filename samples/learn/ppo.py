@@ -12,11 +12,14 @@ import torch
 from torch import nn
 
 HORIZON, EPOCHS, MINIBATCH = 40, 10, 320
-DISCOUNT, TRACE, CLIP, RATE, ENTROPY = 0.97, 0.95, 0.2, 1e-3, 2e-3
+DISCOUNT, TRACE, CLIP, RATE = 0.97, 0.95, 0.2, 1e-3
+FIRST, LAST = 0.6, 0.15  # of the noise of actions, at the beginning and the end: what is learnt is to work without it
 
 
 class Policy(nn.Module):
-    """A Gaussian policy and a value function on the same inputs."""
+    """A Gaussian policy and a value function on the same inputs; `spread` is the standard deviation of its actions."""
+
+    spread = FIRST
 
     def __init__(self, inputs: int, actions: int, wide: int = 64) -> None:
         super().__init__()
@@ -26,10 +29,10 @@ class Policy(nn.Module):
                 nn.Linear(inputs, wide), nn.Tanh(), nn.Linear(wide, wide), nn.Tanh(), nn.Linear(wide, outputs)
             )
 
-        self.mean, self.value, self.spread = net(actions), net(1), nn.Parameter(torch.full((actions,), -0.5))
+        self.mean, self.value = net(actions), net(1)
 
     def around(self, seen: torch.Tensor) -> torch.distributions.Normal:
-        return torch.distributions.Normal(self.mean(seen), self.spread.exp())
+        return torch.distributions.Normal(self.mean(seen), self.spread)
 
     def act(self, seen: np.ndarray) -> np.ndarray:
         """[W, A] the most likely actions."""
@@ -56,10 +59,11 @@ def train(env: Any, folder: Path, steps: int, seed: int = 0) -> Policy:
     while done < steps:
         began = time.process_time()
         left = 1.0 - done / steps
+        policy.spread = LAST + left * (FIRST - LAST)
         for group in optimiser.param_groups:
             group["lr"] = RATE * max(0.1, left)
         batch, seen, wins = rollout(env, policy, seen)
-        update(policy, optimiser, left * ENTROPY, *batch)
+        update(policy, optimiser, *batch)
         done += HORIZON * env.num_envs
         spent += time.process_time() - began
         with curve.open("a", newline="") as out:
@@ -96,7 +100,7 @@ def rollout(env: Any, policy: Policy, seen: np.ndarray) -> tuple[tuple[torch.Ten
     return tuple(part.flatten(0, 1) for part in parts), seen, float(np.mean(ended)) if ended else 0.0
 
 
-def update(policy: Policy, optimiser: torch.optim.Optimizer, entropy: float, *batch: torch.Tensor) -> None:
+def update(policy: Policy, optimiser: torch.optim.Optimizer, *batch: torch.Tensor) -> None:
     observed, actions, likely, advantage, returns, _ = batch
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     for _ in range(EPOCHS):
@@ -105,7 +109,7 @@ def update(policy: Policy, optimiser: torch.optim.Optimizer, entropy: float, *ba
             ratio = (chosen.log_prob(actions[rows]).sum(1) - likely[rows]).exp()
             gain = torch.minimum(ratio * advantage[rows], ratio.clamp(1 - CLIP, 1 + CLIP) * advantage[rows]).mean()
             miss = (policy.value(observed[rows])[:, 0] - returns[rows]).pow(2).mean()
-            loss = 0.5 * miss - gain - entropy * chosen.entropy().sum(1).mean()
+            loss = 0.5 * miss - gain
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()

@@ -24,13 +24,14 @@ def photos_of(scene: Path | None) -> Path | None:
     return folder if folder is not None and all((folder / name).exists() for name in needed) else None
 
 
-def of_room(pixels: np.ndarray, folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+def of_room(pixels: np.ndarray, folder: Path, name: str, without: int = -1) -> tuple[np.ndarray, np.ndarray]:
     """Pixels [N, 2] of a picture [H, W, 3] uint8 at which it shows places [N, 3] m of a reconstructed room: features
-    that look like those of its photos, as far as one camera sees them all. Raises SdfsimError if there are too few."""
+    that look like those of its photos (`without` one), as far as one camera sees them all. Raises SdfsimError if there
+    are too few."""
     import cv2
 
     where, words = _features(cv2.cvtColor(np.ascontiguousarray(pixels), cv2.COLOR_RGB2GRAY))
-    places, point, known = _known(folder)
+    places, point, known = _known(folder, without)
     index = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 64})
     index.add([known])
     seen, found = [], []
@@ -61,7 +62,7 @@ def _features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([key.pt for key in found]) + 0.5, root.astype(np.float32)
 
 
-def _known(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _known(folder: Path, without: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places [P, 3] m of a room, and what they look like in its photos: the place of each [K], and its features
     [K, 128]."""
     import cv2
@@ -77,7 +78,7 @@ def _known(folder: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     for k, view in enumerate(views):
         grey = cv2.imread(str(folder / "photos/images" / view["name"]), cv2.IMREAD_GRAYSCALE)
         own = np.unique(sparse["point_of"][sparse["view_of"] == k])
-        if grey is None or not len(own):
+        if grey is None or not len(own) or k == without:
             continue
         local = xyz[own] @ np.array(view["rotation"]).T + view["translation"]
         flat = local[:, :2] / local[:, 2:]

@@ -1,0 +1,150 @@
+"""Friction and restitution from films: rendered ones with known truth, and cameras found in a room of photos.
+
+    python -m benchmarks film -o DIR [--count 20] [--room ROOM]
+
+Renders `--count` films of a ball that bounces (nothing is known of the camera) and of a box that slides (six points of
+known places), each with other numbers, frame rates, blur, noise and flicker, and identifies each. DIR keeps what was
+found: a run goes on where it ended. ROOM is a run folder of `sdfsim reconstruct`: the camera of every fifth photo is
+found by the points that the other photos show.
+
+Drawn by chance: restitution .5 to .9, friction .15 to .6, 320 x 240 pixels, 30 or 60 frames a second.
+"""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.spatial.transform import Rotation
+
+from benchmarks.records import Out, write_record
+from sdfsim.apps.film.camera import of_points
+from sdfsim.apps.film.film import identify_clips
+from sdfsim.apps.film.room import of_room
+from sdfsim.base.errors import SdfsimError
+from sdfsim.base.files import read_json, write_json
+from sdfsim.scene.builder import SceneBuilder
+from sdfsim.simulate.camera import Camera
+
+SIZE = {"width": 320, "height": 240}
+EVERY = 5  # photos of a room of which one is tried
+
+
+def shown(rng: np.random.Generator) -> dict[str, Any]:
+    """How a film is taken."""
+    return {
+        "fps": float(rng.choice([30, 60])), "exposure": rng.uniform(0.1, 0.6), "noise": rng.uniform(1, 4),
+        "flicker": rng.choice([0.0, 0.03]), "subframes": 3,
+    }  # fmt: skip
+
+
+def ball(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
+    from tests.helpers.clips import bouncing, filmed
+
+    restitution, radius = rng.uniform(0.5, 0.9), rng.uniform(0.03, 0.06)
+    start = [-0.3, 0.0, rng.uniform(0.5, 0.9)]
+    scene = SceneBuilder(model="solver").add("floor", plane={}, restitution=1.0)
+    color = rng.integers(30, 220, 3).tolist()
+    scene.add("ball", sphere={"radius": radius}, position=start, mass=0.1, color=color, restitution=0.6)
+    motion = bouncing(start, [rng.uniform(0.2, 0.5), rng.uniform(-0.2, 0.2), 0], radius, restitution, 0.4)
+    place = (rng.uniform(0.8, 1.3), rng.uniform(-1.8, -1.4), rng.uniform(0.4, 0.9))
+    camera = Camera(place, look_at=(0, 0, 0.3), fov=rng.uniform(36, 48), **SIZE)
+    clip = filmed(folder / "clip.mp4", scene.load(), motion, camera, 1.4, **shown(rng))
+    return found_in(clip, scene, restitution, "restitution", "ball / floor")
+
+
+def box(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
+    from tests.helpers.clips import GRAVITY, filmed
+
+    friction, length = rng.uniform(0.15, 0.6), rng.uniform(0.4, 0.6)
+    speed, size = np.sqrt(2 * friction * GRAVITY * length), rng.uniform(0.06, 0.14, 3)
+    turn, up = Rotation.from_rotvec([0, 0, rng.uniform(0, 3)]).as_quat(), 0.5 * size[2]
+
+    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
+        t = min(time, speed / (friction * GRAVITY))
+        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, up]
+        return np.array([[0, 0, 0], place]), np.array([[0, 0, 0, 1.0], turn])
+
+    scene = SceneBuilder(model="solver").add("floor", plane={}, friction=1.0, restitution=1.0)
+    color = rng.integers(30, 220, 3).tolist()
+    scene.add("box", box={"size": size.tolist()}, position=[-0.35, 0, up], quat_xyzw=turn, mass=0.3, color=color)
+    camera = Camera((rng.uniform(0.2, 0.6), -1.1, rng.uniform(0.5, 0.8)), look_at=(0, 0, 0), fov=45, **SIZE)
+    places = np.array([[-0.4, -0.3, 0], [0.4, -0.3, 0], [0.4, 0.3, 0], [-0.4, 0.3, 0], [0, 0, 0], [-0.3, 0.2, 0.25]])
+    pixels = camera.project(places)[0] + rng.normal(0, 0.5, (6, 2))
+    points = [{"pixel": p.tolist(), "place": q.tolist()} for p, q in zip(pixels, places, strict=True)]
+    (folder / "points.yaml").write_text(yaml.safe_dump({"points": points}))
+    clip = filmed(folder / "clip.mp4", scene.load(), motion, camera, 1.0, **shown(rng))
+    return found_in(clip, scene, friction, "friction", "box / floor", folder / "points.yaml")
+
+
+def found_in(
+    clip: Path, scene: SceneBuilder, truth: float, kind: str, name: str, points: Path | None = None
+) -> dict[str, Any]:
+    """What a film shows of a number."""
+    try:
+        value = {(e.kind, e.name): e for e in identify_clips([clip], scene.load(), points=points).estimates}
+    except SdfsimError as error:
+        return {"truth": truth, "said": error.message}
+    one = value[kind, name]
+    if one.value is None or one.interval is None:
+        return {"truth": truth, "said": "not shown"}
+    return {"truth": truth, "found": one.value, "interval": list(one.interval)}
+
+
+def cameras(room: Path) -> list[list[Any]]:
+    """Rows of how far the cameras of photos are from those that the room's other photos show."""
+    import cv2
+
+    from pipeline.cameras import Similarity, load_views
+    from pipeline.mesh.placement import load_placement
+
+    to_unit = Similarity.from_dict(read_json(room / "distill/field.json", "")["to_unit"])
+    way = load_placement(room / "mesh").to_metres.after(to_unit)
+    focal, place, sure = [], [], []
+    views = load_views(room / "poses")
+    for k in range(2, len(views), EVERY):
+        view = way.view(views[k])
+        pixels = cv2.imread(str(room / "photos/images" / view.name))[:, :, ::-1]
+        size = (view.width, view.height)
+        eye = of_points(*of_room(pixels, room, view.name, without=k), None, size, view.name)
+        focal.append(abs(eye.focal / view.focal - 1.0))
+        local = eye.rotation @ (view.center + eye.rotation.T @ eye.translation)
+        place.append(float(np.linalg.norm(local)))
+        doubt = np.sqrt(np.square(eye.doubt[3:6]).sum(1))
+        sure.append(bool((np.abs(local) < 2.8 * doubt).all()))  # all three of them in 95 of 100
+    count = len(focal)
+    return [
+        ["focal length, in a room", count, float(np.median(focal)), max(focal), "", 0],
+        ["place of the camera, in a room, m", count, float(np.median(place)), max(place), f"{sum(sure)} of {count}", 0],
+    ]
+
+
+def main(out: Out, *, count: int = 20, room: Path | None = None) -> None:
+    rows = []
+    kinds: dict[str, Callable[[np.random.Generator, Path], dict[str, Any]]] = {
+        "restitution of a ball, nothing known of the camera": ball, "friction of a box, six points": box,
+    }  # fmt: skip
+    for what, kind in kinds.items() if count else ():
+        every = []
+        for seed in range(count):
+            folder = out / f"{kind.__name__}-{seed}"
+            folder.mkdir(parents=True, exist_ok=True)
+            if not (folder / "found.json").exists():
+                write_json(folder / "found.json", kind(np.random.default_rng(seed), folder))
+                print(what, seed, json.dumps(read_json(folder / "found.json", "")), flush=True)
+            every.append(read_json(folder / "found.json", ""))
+        seen = [one for one in every if "found" in one]
+        off = [abs(one["found"] - one["truth"]) for one in seen]
+        covers = sum(one["interval"][0] <= one["truth"] <= one["interval"][1] for one in seen)
+        rows.append([what, count, float(np.median(off)), max(off), f"{covers} of {len(seen)}", count - len(seen)])
+    rows += cameras(room) if room else []
+    rows.sort(key=lambda row: -row[3])
+    columns = ("what was found", "films", "error, median", "largest", "interval covers", "not shown or refused")
+    write_record("film", "python -m benchmarks film -o DIR --room ROOM", str(__doc__).rpartition("\n\n")[2].strip(),
+                 columns, rows)  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(Path("film"))
