@@ -95,12 +95,12 @@ def measure(
     photos: Photos,
     out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="The page to write.")] = Path("measure.html"),
 ) -> None:
-    """Photos -> a page in which clicks give --distance and --body."""
+    """Photos or a film -> a page in which clicks give --distance, --body, and points for identify."""
     from pipeline.measure import measure as write_page
 
     report = write_page(photos, out, on_progress=session.progress)
     told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
-    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body"])
+    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body, and four or more identify --points"])
 
 
 @command

@@ -16,6 +16,7 @@ from pipeline.measure import measure
 from pipeline.mesh.placement import check_distance
 from pipeline.options import options_of
 from sdfsim import Scene, Simulator
+from sdfsim.apps.film.camera import read_points
 from sdfsim.apps.recording import save_rollout
 from sdfsim.simulate.looks import body_colors
 from tests.helpers.browser import Browser
@@ -93,6 +94,17 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
             assert np.abs(at - DOTS[name]).max() < 0.003 * long_side + 1
         browser.value("document.getElementById('undo').click()")
         assert option()[:-4] == command and option()[-4] == "--distance"
+        # Known places of a film: the file that `identify --points` reads.
+        browser.value("document.getElementById('known').click()")
+        places = [[0, 0, 0], [0.297, 0, 0], [0.297, 0.21, 0], [0, 0.21, -0.5]]
+        for place in places:
+            browser.value(f"document.getElementById('xyz').value = '{str(place)[1:-1]}'")
+            click_dot("turned.jpg")
+        file = tmp_path / "points.yaml"
+        file.write_text(browser.value("document.getElementById('option').textContent"))
+        pixels, known, focal = read_points(file)
+        assert known.tolist() == places and focal is None
+        assert np.abs(pixels - np.add(DOTS["turned.jpg"], 0.5)).max() < 0.003 * 1200 + 1
         assert not browser.errors
 
 
