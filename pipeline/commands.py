@@ -100,7 +100,7 @@ def measure(
 
     report = write_page(photos, out, on_progress=session.progress)
     told = f"wrote {out}: {report['photos']} photos, {report['mib']} MiB"
-    session.report(report, [told, "open it in a browser: two clicks give --distance, one gives --body, and four or more identify --points"])
+    session.report(report, [told, "open it in a browser: clicks give --distance, --body, and identify --points"])
 
 
 @command
