@@ -20,7 +20,7 @@ class RoundForm:
     """A round solid in the frame of a mesh."""
 
     kind: Any  # "sphere", "cylinder", "capsule", "cone" or "torus"
-    sizes: dict[str, float]  # m, as `analytic_shape` takes them
+    sizes: dict[str, Any]  # m, as `analytic_shape` takes them
     pose: np.ndarray  # [4, 4], of its own frame in the mesh's
 
     def __str__(self) -> str:

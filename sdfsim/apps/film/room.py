@@ -105,7 +105,7 @@ def _agreeing(seen: np.ndarray, places: np.ndarray, size: tuple[int, ...]) -> np
             places, seen, lens, None, iterationsCount=1000, reprojectionError=most, flags=cv2.SOLVEPNP_SQPNP
         )
         if done and rows is not None and len(rows) > len(best):
-            best = rows[:, 0]
+            best = np.asarray(rows).ravel()
     order, away = best[:1], np.full(len(best), np.inf)
     while len(order) and len(order) < min(MOST, len(best)):  # always the one that is farthest from those before
         away = np.minimum(away, np.linalg.norm(seen[best] - seen[order[-1]], axis=1))
