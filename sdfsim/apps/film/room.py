@@ -85,7 +85,7 @@ def _known(folder: Path, without: int) -> tuple[np.ndarray, np.ndarray, np.ndarr
         bent = flat * (1 + view["k"] * np.square(flat).sum(1, keepdims=True))
         where, looks = _features(grey)
         if len(where):
-            away, nearest = KDTree(where).query(view["focal"] * bent + (view["cx"], view["cy"]))
+            away, nearest = map(np.asarray, KDTree(where).query(view["focal"] * bent + (view["cx"], view["cy"])))
             points.append(own[away < NEAR])
             words.append(looks[nearest[away < NEAR]])
     return places, np.concatenate(points), np.concatenate(words)
