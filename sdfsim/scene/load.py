@@ -185,9 +185,8 @@ def _load_shapes(
 ) -> tuple[dict[str | None, str | None], dict[str | None, Shape], dict[str | None, np.ndarray]]:
     """Load the shapes in use. Returns for each key, in order of first use, the first key with the same entry (in Python
     every body may bring its own copy of a mesh); the shapes of these first keys; and the frames [4, 4] of those that
-    are round in place of their meshes, in these. The key None is the plane that all
-    bodies with a `plane` share. Shapes that must be fitted or sampled are made last, when all else is valid: a fit
-    takes a minute."""
+    are round in place of their meshes, in these. The key None is the plane that all bodies with a `plane` share. Shapes
+    that must be fitted or sampled are made last, when all else is valid: a fit takes a minute."""
     first: dict[str, str] = {}
     same: dict[str | None, str | None] = {}
     for key in dict.fromkeys(body.shape for body in table.bodies):
@@ -230,6 +229,7 @@ def _as_round(name: str, entry: ShapeTable) -> tuple[Shape, np.ndarray] | None:
     if form is None:
         return None
     shape = analytic_shape(form.kind, name=name, **form.sizes)
+    shape = with_wall(shape, entry.wall) if entry.wall else shape
     skin = skin_of([Part("mesh", pose_of(), {}, moved(loaded.skin or loaded.mesh, units))], form.pose)
     return replace(shape, skin=skin, source=shape.source | {"notes": [str(form)]}), form.pose
 
