@@ -1,4 +1,4 @@
-"""Learn to push a mug to a place on a table, in about five minutes of one core.
+"""Learn to push a mug to a place on a table, in about seven minutes of one core.
 
     python samples/learn/push.py                        # trains, or goes on; writes policy, curve and film to push/
     python samples/learn/push.py --scene room/scene.yaml --body mug     # on your own table
