@@ -71,6 +71,7 @@ def train(env: Any, folder: Path, steps: int, seed: int = 0) -> Policy:
         known = {"policy": policy.state_dict(), "optimiser": optimiser.state_dict(), "steps": done, "seconds": spent}
         torch.save(known, file)
         print(f"{done} steps, {spent:.0f} s of CPU: {wins:.0%} of episodes end in success", flush=True)
+    policy.spread = LAST
     return policy
 
 
@@ -115,12 +116,16 @@ def update(policy: Policy, optimiser: torch.optim.Optimizer, *batch: torch.Tenso
             optimiser.step()
 
 
-def success(env: Any, policy: Policy, seed: int) -> float:
-    """The part of the worlds whose next episode ends in success, with the most likely actions."""
+def success(env: Any, policy: Policy, seed: int, *, noise: bool = False) -> float:
+    """The part of the worlds whose next episode ends in success, with the most likely actions, or with the `noise` that
+    the policy had at the end of its training."""
     seen, _ = env.reset(seed=seed)
     won, over = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
+    draw = np.random.default_rng(seed)
     while not over.all():
-        seen, _, lost, late, infos = env.step(policy.act(seen))
+        actions = policy.act(seen)
+        actions = actions + policy.spread * draw.standard_normal(actions.shape).astype(np.float32) * noise
+        seen, _, lost, late, infos = env.step(actions)
         fresh = (lost | late) & ~over
         won[fresh], over = infos["is_success"][fresh], over | lost | late
     return float(won.mean())
