@@ -149,7 +149,10 @@ class ContactGeometry:
         sdf, grid = self.sdf, self.grid
         if isinstance(sdf, BoxSdf | CylinderSdf | ConeSdf | TorusSdf) and len(self.nodes):
             spacing = max(0.5 * min(sdf.sizes), np.sqrt(_area(sdf) / DENSEST))
-            nodes = _on_box(np.array(sdf.half), spacing) if isinstance(sdf, BoxSdf) else _revolved(sdf, spacing)
+            if isinstance(sdf, BoxSdf):
+                nodes = _on_box(np.array(sdf.half), spacing)
+            else:
+                nodes = _on_cylinder(sdf, spacing) if isinstance(sdf, CylinderSdf) else _revolved(sdf, spacing)
             patches, cover = patches_of(sdf, nodes, ()), np.full(len(nodes), 0.75 * spacing)
         else:
             nodes, samples = self.nodes, self.nodes[:0]
@@ -309,29 +312,40 @@ def _on_box(half: np.ndarray, spacing: float) -> np.ndarray:
     return np.unique(np.concatenate(sides), axis=0)
 
 
-def _revolved(sdf: CylinderSdf | ConeSdf | TorusSdf, spacing: float) -> np.ndarray:
-    """Points all over a solid of revolution about z, rims and tips included: rings of points at most `spacing` m apart
-    around places on its outline that are as close."""
+def _on_cylinder(sdf: CylinderSdf, spacing: float) -> np.ndarray:
+    """Points all over a cylinder, at most `spacing` m apart, rims included."""
+    turns = _turns(2.0 * np.pi * sdf.radius, spacing)
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    heights = np.linspace(-sdf.half, sdf.half, 1 + max(1, int(np.ceil(2.0 * sdf.half / spacing))))
+    radii = np.linspace(0.0, sdf.radius, 1 + max(1, int(np.ceil(sdf.radius / spacing))))[:-1]
+    side = [np.column_stack([sdf.radius * circle, np.full(len(circle), z)]) for z in heights]
+    ends = [np.column_stack([r * circle, np.full(len(circle), z)]) for z in (-sdf.half, sdf.half) for r in radii[1:]]
+    tips = [np.array([[0.0, 0.0, -sdf.half], [0.0, 0.0, sdf.half]])]
+    return np.concatenate([*side, *ends, *tips])
+
+
+def _revolved(sdf: ConeSdf | TorusSdf, spacing: float) -> np.ndarray:
+    """Points all over a cone or torus, its rim and tip included: rings of points at most `spacing` m apart around
+    places on its outline that are as close."""
     if isinstance(sdf, TorusSdf):
         turns = _turns(2.0 * np.pi * sdf.tube, spacing)
         outline = np.stack([sdf.radius + sdf.tube * np.cos(turns), sdf.tube * np.sin(turns)], axis=1)
     else:
-        top = sdf.radius if isinstance(sdf, CylinderSdf) else 0.0
-        corners = np.array([[0.0, -sdf.half], [sdf.radius, -sdf.half], [top, sdf.half], [0.0, sdf.half]])
+        corners = np.array([[0.0, -sdf.half], [sdf.radius, -sdf.half], [0.0, sdf.half]])
         outline = corners[:1]
         for start, end in pairwise(corners):
             parts = int(np.ceil(np.linalg.norm(end - start) / spacing))
-            outline = np.concatenate(
-                [outline, start + np.arange(1, parts + 1)[:, None] / max(parts, 1) * (end - start)]
-            )
-    rings = []
-    for r, z in outline:
-        turns = _turns(2.0 * np.pi * r, spacing)
-        rings.append(np.column_stack([r * np.cos(turns), r * np.sin(turns), np.full(len(turns), z)]))
+            outline = np.concatenate([outline, start + np.arange(1, parts + 1)[:, None] / parts * (end - start)])
+    turns = _turns(2.0 * np.pi * float(outline[:, 0].max()), spacing)
+    rings = [
+        np.column_stack([r * np.cos(some), r * np.sin(some), np.full(len(some), z)])
+        for r, z in outline
+        for some in (turns if r > 0.0 else turns[:1],)
+    ]
     return np.concatenate(rings)
 
 
 def _turns(length: float, spacing: float) -> np.ndarray:
-    """Angles, rad, of points around a circle of `length` m; one for a circle of no size."""
-    count = max(8, int(np.ceil(length / spacing))) if length > 0.0 else 1
+    """Angles, rad, of points around a circle of `length` m."""
+    count = max(8, int(np.ceil(length / spacing)))
     return 2.0 * np.pi * np.arange(count) / count
