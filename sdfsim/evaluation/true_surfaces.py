@@ -131,6 +131,8 @@ def of_mesh(mesh: Mesh) -> TrueSurface:
     across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = np.linalg.norm(across, axis=1)
     normals = across / np.maximum(area, 1e-300)[:, None]
+    planes = normals[area > 1e-12 * size * size]
+    offset = (planes * corner[area > 1e-12 * size * size, 0]).sum(1)
     tree, winding = igl.AABB(), Winding(mesh)
     tree.init(vertices, faces)
 
@@ -139,13 +141,16 @@ def of_mesh(mesh: Mesh) -> TrueSurface:
         squared, face, closest = (np.asarray(part) for part in answer)
         length, normal, away = np.sqrt(squared), normals[face], points - closest
         # Wherever the nearest point is within a face, the way to the surface is along the normal. At edges the winding
-        # number gives the sign; of those of convex solids only where a face looks away.
+        # number gives the sign; of a convex solid the planes of its faces, where one looks away.
         height = (away * normal).sum(1)
         inside = height < -0.5 * length
         a, b, c = (corner[face, k] for k in range(3))
         parts = [(np.cross(q - p, closest - p) * normal).sum(1) for p, q in ((a, b), (b, c), (c, a))]
         unclear = (np.min(parts, axis=0) <= 1e-6 * area[face]) & (length > 0) & (inside | (not convex))
-        if unclear.any():
+        if unclear.any() and convex:
+            parts = np.array_split(points[unclear], 1 + unclear.sum() * len(planes) // 2**22)
+            inside[unclear] = np.concatenate([(part @ planes.T - offset).max(1) < 0 for part in parts])
+        elif unclear.any():
             inside[unclear] = winding(points[unclear]) > 0.5
         # If a surface is folded flat, the nearest layer may face the other way. Behind an open surface the winding
         # number is a fraction.
