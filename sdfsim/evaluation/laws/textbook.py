@@ -1,14 +1,17 @@
 """Laws of a textbook in closed form: single bodies and stacks, tighter than in everyday scenes."""
 
 from collections.abc import Iterator
-from math import atan, cos, radians, sin, sqrt, tan
+from math import atan, cos, pi, radians, sin, sqrt, tan
 from typing import Any
 
 import numpy as np
+from scipy.integrate import quad
 
 from sdfsim.evaluation.laws.check import Check, most, near
-from sdfsim.evaluation.laws.scenes import STILL, UNIT, G, Put, Setting, about, floor, run, run_built, solid
+from sdfsim.evaluation.laws.scenes import DENSITY, STILL, UNIT, G, Put, Setting, about, floor, run, run_built, solid
+from sdfsim.geometry.primitives import revolve
 from sdfsim.scene.builder import SceneBuilder
+from sdfsim.shape.make import mesh_shape
 
 METRE = sqrt(UNIT)  # times and speeds at 10 cm for one of bodies of a metre
 STARTS = (0.95, 0.98, 1.0, 1.03, 1.07)  # sizes
@@ -222,6 +225,37 @@ def parting(at: Setting) -> Iterator[Check]:
     yield ran.most("speed", abs(ran.rollout.velocity[-1, 1, 0]), 1e-9, "m/s")
 
 
+def rocking(at: Setting) -> Iterator[Check]:
+    """A hollow half ball that rocks, rolling or without friction, has the period that energy gives it, and gains
+    none."""
+    turn = np.linspace(-pi / 2, 0.0, 40)
+    shell = [np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1) for radius in (0.5, 0.45)]
+    profile = np.concatenate([shell[0], shell[1][::-1]])
+    profile[[0, -1], 0] = 0.0
+    lean = 20.0
+    for kind in ("mesh", "grid"):
+        half_ball = mesh_shape(revolve(profile, 96), name="half ball", kind=kind)
+        low, inertia = -half_ball.com[2], half_ball.inertia[0, 0] / half_ball.volume
+        for mu in (0.0, 1.0):
+
+            def pace(angle: float, mu: float = mu, low: float = low, inertia: float = inertia) -> float:
+                """Speed of the angle, over that of a fall by one size, at unit length and gravity."""
+                arm = 0.25 + low**2 - low * cos(angle) if mu else (low * sin(angle)) ** 2
+                return sqrt(2 * low * (cos(angle) - cos(radians(lean))) / (inertia + arm))
+
+            quarter = quad(lambda u, pace=pace: 2 * u / pace(radians(lean) - u * u), 0.0, sqrt(radians(lean)))[0]
+            period = 4 * quarter * sqrt(UNIT / G)
+            put = Put("it", half_ball, [0, 0, 0.5], about("y", lean), mu=mu)
+            ran = run(at, f"{kind}, mu = {mu:g}", [put, floor()], 10 * period)
+            swing, time = ran.turn("it").apply([0, 0, 1])[:, 0], ran.seconds
+            down = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
+            first = time[down] + swing[down] / (swing[down] - swing[down + 1]) * (time[down + 1] - time[down])
+            yield ran.near("period", float(np.diff(first).mean()), period, 0.03, "s")
+            energy = ran.energy()
+            swings = put.dense * DENSITY * half_ball.volume * at.size**4 * G * low * (1 - cos(radians(lean)))
+            yield ran.most("energy gained", (energy - np.minimum.accumulate(energy)).max() / swings, 0.06)
+
+
 TEXTBOOK = (
-    bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays, soft, gliding, parting,
+    bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays, soft, gliding, parting, rocking,
 )  # fmt: skip

@@ -24,7 +24,7 @@ from sdfsim.physics.solver.distance import (
     true_distance,
 )
 from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
-from sdfsim.physics.solver.triangles import closest
+from sdfsim.physics.solver.triangles import closest, lowest_corner
 from sdfsim.physics.solver.vectors import (
     BARE,
     INLINED,
@@ -54,6 +54,8 @@ ONTO_IT = 0.05  # cells: a point this near a surface is on it
 STRIDE, FINEST = 0.02, 5e-4  # first and last step of the refinement, relative to a body's size
 LONGER = 4.0  # a step is at most this many times the last one
 SHARPER, SHARPEST = 4, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
+LEVEL_FACE = 0.1  # slope below which steps along triangles are too short, and their corners are compared
+PROBED = 0.01  # cells: a body that has moved by more may have rolled over a ripple of its grid
 WITHIN = 0.5  # cells: how far the refinement on a grid may end from where triangles are nearest
 AWAY, TRACED = 1e-6, 12  # model lengths: farther points do not touch yet; and steps of a search along their way
 BEADS, FIXED = 32, 8  # points on a core at which distances are taken; and those of a whole circle that touch
@@ -139,7 +141,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         if count == FOUND:
             break
         if e < 0:
-            key, stride, at = 0, STRIDE * size, -1
+            key, stride, at, around = 0, STRIDE * size, -1, STRIDE * size
             p = _foot(shapes, r, mapped(back, middle, (0.0, 0.0, half * (e + 2))))
             if abs(distance_alone(shapes.table, shapes.brick, shapes.sample, r, p)) > ONTO_IT * shapes.table[r, CELL]:
                 continue  # too far to reach the surface
@@ -147,6 +149,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         else:
             i, stride = scratch.pick[e], STRIDE * size
             key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
+            around = 2.0 * shapes.cover[scratch.node[i]]
             d, n = scratch.depth[i] / k, get(scratch.normal, i)
         found = False
         if at >= 0 and near.placed[at]:
@@ -163,6 +166,8 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             p, d, n = _refined(
                 shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
             )
+        if found and not sharp and way > PROBED * own * _cell(shapes, r):
+            p, d, n = _past_ripples(shapes, FINEST * size, r, s, w, c, k, own, p, d, n)
         if sharp:
             here = sub(scale(p, own), get(world.com, one))
             if _is_found(scratch.found, begun, count, side, here, apart):
@@ -170,7 +175,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             if not found:
                 p = _onto(shapes, r, p, 2.0 * shapes.table[r, ERROR])
                 stride = apart / own
-            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARPEST * size)
+            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARPEST * size, around)
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
@@ -368,9 +373,37 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
 
 
 @njit(**INLINED)
-def _descended(shapes, s, t, w, c, k, own, p, step, least):
+def _past_ripples(shapes, least, s, t, w, c, k, own, p, d, n):
+    """A lower point of a grid's surface than p, where `_refined` ended, if there is one a cell away: the surface of a
+    grid ripples with its cells. A push behind the lowest point of a body that rolls would drive it."""
+    table, brick, sample = shapes.table, shapes.brick, shapes.sample
+    cell, d = table[s, CELL], d / k
+    for _ in range(2):
+        _, m = distance(table, brick, sample, s, p)
+        u, v = across(m)
+        low, place = d, p
+        for way in range(WAYS):
+            angle = 2.0 * math.pi * way / WAYS
+            q = add(p, scale(add(scale(u, math.cos(angle)), scale(v, math.sin(angle))), cell))
+            for _ in range(2):
+                off, m = distance(table, brick, sample, s, q)
+                q = along(q, m, -off)
+            there = distance_alone(table, brick, sample, t, mapped(w, c, q))
+            if there < low - 1e-9:
+                low, place = there, q
+        if low == d:
+            break
+        d, n = distance(table, brick, sample, t, mapped(w, c, place))
+        p, d, n = _refined(table, brick, sample, 0.5 * cell, least, s, t, w, c, k, own, place, d, n)
+        d = d / k
+    return p, k * d, n
+
+
+@njit(**INLINED)
+def _descended(shapes, s, t, w, c, k, own, p, step, least, around):
     """Descend along the true surface of s, from a point on it, to lower distances of the true one of t, by steps along
-    the other's normal and back onto the surface. Returns the point, the distance at the scale of t, and the normal."""
+    the other's normal and back onto the surface, on nearly level faces to the lowest corner `around`. Returns the
+    point, the distance at the scale of t, and the normal."""
     ratio = k / own
     d, n = true_distance(shapes, t, mapped(w, c, p))
     for _ in range(SHARPER):
@@ -382,6 +415,8 @@ def _descended(shapes, s, t, w, c, k, own, p, step, least):
             (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
         )
         q = _onto(shapes, s, along(p, g, -step), 1.01 * step)
+        if norm(sub(q, p)) <= LEVEL_FACE * step:
+            q = lowest_corner(shapes.triangles, s, p, g, around)
         if norm(sub(q, p)) <= least:
             break
         there, normal = true_distance(shapes, t, mapped(w, c, q))

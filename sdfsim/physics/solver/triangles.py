@@ -125,6 +125,34 @@ def highest(triangles, s, p, up, radius):
 
 
 @njit(**BARE)
+def lowest_corner(triangles, s, p, up, radius):
+    """The corner of shape s that is lowest along `up`, of those of triangles within a distance of p; p if none is
+    lower."""
+    if triangles.level[s] < 0:
+        return p
+    level, first, root = triangles.level[s], triangles.first[s], triangles.root[s]
+    count, leaves = triangles.first[s + 1] - first, 1 << level
+    low, place = dot(up, p), p
+    i = 1
+    while True:
+        if _off(triangles, root + i - 1, p) < radius * radius:
+            if i < leaves:
+                i *= 2
+                continue
+            leaf = i - leaves
+            for t in range(first + (count * leaf >> level), first + (count * (leaf + 1) >> level)):
+                for k in range(3):
+                    corner = get(triangles.corner[t], k)
+                    if dot(up, corner) < low and norm(sub(corner, p)) < radius:
+                        low, place = dot(up, corner), corner
+        i += 1
+        while i & 1 == 0:
+            i >>= 1
+        if i == 1:
+            return place
+
+
+@njit(**BARE)
 def _off(triangles, b, p):
     """The squared distance of p from a box."""
     total = 0.0
