@@ -126,16 +126,17 @@ def highest(triangles, s, p, up, radius):
 
 @njit(**BARE)
 def lowest_corner(triangles, s, p, up, radius):
-    """The corner of shape s that is lowest along `up`, of those of triangles within a distance of p; p if none is
-    lower."""
+    """The corner of shape s that is lowest along `up`, of those within a distance of p; p if none is lower."""
     if triangles.level[s] < 0:
         return p
     level, first, root = triangles.level[s], triangles.first[s], triangles.root[s]
     count, leaves = triangles.first[s + 1] - first, 1 << level
-    low, place = dot(up, p), p
-    i = 1
+    low, place, i = dot(up, p), p, 1
     while True:
-        if _off(triangles, root + i - 1, p) < radius * radius:
+        b, least = root + i - 1, 0.0
+        for x in range(3):
+            least += up[x] * triangles.box[b, x if up[x] > 0.0 else 3 + x]
+        if least < low and _off(triangles, b, p) < radius * radius:
             if i < leaves:
                 i *= 2
                 continue
