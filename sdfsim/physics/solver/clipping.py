@@ -21,7 +21,7 @@ from sdfsim.physics.solver.convex import (
     outermost,
     rounding,
 )
-from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, turn, turn_back
+from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, sub, turn, turn_back
 
 RIM = 24  # points on the circle of the end of a drum or cone that bound its contact
 MOST = 160  # largest number of corners of a clipped face
@@ -30,7 +30,8 @@ STEEP = 0.1  # cosine between a face's normal and the contact's, below which the
 LEVEL = 1e-3  # slope of a drum's end relative to the normal, below which its circle is cut at fixed points
 ASIDE = 0.002  # relative to the thickness: edges touch along their length if they are no farther aside
 TIED = 1e-4  # relative to the thickness: points whose depths differ by less count as equally deep
-CLOSE = 1e-3  # relative to the contact's extent: nearer points are one
+BULGE = 0.05  # relative to a small face: how far a circle may bulge beyond the points on it that bound the face
+CLOSE = 1e-4  # relative to the contact's extent: nearer points are one
 
 
 class Polygons(NamedTuple):
@@ -165,6 +166,11 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
         _project(room.second, second, (0.0, 0.0, 0.0), n, u, w)
         if second > 2 and abs(dot(k, n)) < STEEP:
             second = 1
+        if first > 2 and second > 2:
+            if first == RIM and convex.table[pair.first, KIND] != HULL:
+                _sharpen(room.first, room.second, second)
+            if second == RIM and convex.table[pair.second, KIND] != HULL:
+                _sharpen(room.second, room.first, first)
         if first > 1 and second > 2:
             count = _clip(room, room.first, first, room.second, second)
             for i in range(count):
@@ -209,6 +215,34 @@ def _project(points, count, offset, n, u, w):
     for i in range(count):
         p = add(get(points, i), offset)
         put(points, i, (dot(p, u), dot(p, w), dot(p, n)))
+
+
+@njit(**BARE)
+def _sharpen(rim, face, count):
+    """Move the points on the circle of a drum's end closer together beside a face that is small and crosses it."""
+    x = y = cx = cy = far = 0.0
+    for i in range(count):
+        x, y = x + face[i, 0] / count, y + face[i, 1] / count
+    for i in range(count):
+        far = max(far, (face[i, 0] - x) ** 2 + (face[i, 1] - y) ** 2)
+    for i in range(RIM):
+        cx, cy = cx + rim[i, 0] / RIM, cy + rim[i, 1] / RIM
+    middle = scale(add(get(rim, 0), get(rim, RIM // 2)), 0.5)
+    one, two = sub(get(rim, 0), middle), sub(get(rim, RIM // 4), middle)
+    x, y, far = x - cx, y - cy, math.sqrt(far)
+    radius, off = math.sqrt(dot(one, one)), math.sqrt(x * x + y * y)
+    step = math.sqrt(BULGE * far / radius)
+    if step >= 2.0 * math.pi / RIM or off + far < (1.0 - BULGE) * radius:
+        return
+    area = one[0] * two[1] - one[1] * two[0]
+    towards = math.atan2((one[0] * y - one[1] * x) / area, (x * two[1] - y * two[0]) / area)
+    for i in range(RIM):
+        k = i - RIM // 2
+        angle = k * step
+        if abs(k) > RIM // 4:  # the rest of the circle
+            start = RIM // 4 * step
+            angle = math.copysign(start + (math.pi - start) * (abs(k) - RIM // 4) / (RIM // 4), k)
+        put(rim, i, along(along(middle, one, math.cos(towards + angle)), two, math.sin(towards + angle)))
 
 
 @njit(**BARE)

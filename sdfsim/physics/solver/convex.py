@@ -40,7 +40,7 @@ TOUCHING = 1e-4  # relative to the thickness: nearer solids are moved apart firs
 APART = 1e-3  # relative to the thickness: overlapping solids are moved this far apart
 # Cosine between a normal and that of a face, above which the face's is taken; and, relative to the thickness, the
 # difference of depth at which two normals count as equally good.
-ALONG, AS_MUCH = 1.0 - 1e-9, 1e-9
+ALONG, AS_MUCH = 1.0 - 5e-6, 1e-9
 EXACT = 1e-14  # relative precision of squared distances
 FEW = 48  # vertices that are all tested; in larger hulls the search climbs from neighbour to neighbour
 STEPS, ROUNDS = 48, 16  # largest numbers of GJK steps, and of rounds for normals
@@ -220,8 +220,18 @@ def _squared(convex, matrix, pair, n, s, thick):
     for side in range(2):
         p, body = (pair.first, pair.a) if side == 0 else (pair.second, pair.b)
         kind = convex.table[p, KIND]
+        x, y, z = turn_back(matrix, body, n)
+        if kind == HULL:
+            out = (-x, -y, -z) if side == 0 else (x, y, z)
+            top = outermost(convex, p, out)
+            for e in range(convex.around_start[top], convex.around_start[top + 1]):
+                face = get(convex.face, convex.around[e])
+                if dot(face, out) > ALONG:
+                    m = turn(matrix, body, scale(face, -1.0 if side == 0 else 1.0))
+                    found = separation(convex, matrix, pair, m)
+                    if found >= s - AS_MUCH * thick:
+                        return m, found
         if kind == BLOCK or kind == DRUM or kind == CONE:
-            x, y, z = turn_back(matrix, body, n)
             flat = abs(z) > ALONG or (kind == BLOCK and (abs(x) > ALONG or abs(y) > ALONG))
             if flat:
                 m = turn(matrix, body, (float(round(x)), float(round(y)), float(round(z))))
