@@ -391,10 +391,10 @@ def _past_ripples(shapes, least, s, t, w, c, k, own, p, d, n):
             there = distance_alone(table, brick, sample, t, mapped(w, c, q))
             if there < low - 1e-9:
                 low, place = there, q
-        if low == d:
+        there, m = distance(table, brick, sample, t, mapped(w, c, place))
+        if low == d or dot(m, n) <= ALIKE:
             break
-        d, n = distance(table, brick, sample, t, mapped(w, c, place))
-        p, d, n = _refined(table, brick, sample, 0.5 * cell, least, s, t, w, c, k, own, place, d, n)
+        p, d, n = _refined(table, brick, sample, 0.5 * cell, least, s, t, w, c, k, own, place, there, m)
         d = d / k
     return p, k * d, n
 
@@ -415,12 +415,13 @@ def _descended(shapes, s, t, w, c, k, own, p, step, least, around):
             (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
         )
         q = _onto(shapes, s, along(p, g, -step), 1.01 * step)
-        if norm(sub(q, p)) <= LEVEL_FACE * step:
-            q = lowest_corner(shapes.triangles, s, p, g, around)
+        level = norm(sub(q, p)) <= LEVEL_FACE * step
+        if level:
+            q = lowest_corner(shapes.triangles, s, p, g, around, LEVEL_FACE)
         if norm(sub(q, p)) <= least:
             break
         there, normal = true_distance(shapes, t, mapped(w, c, q))
-        if there < d - 1e-9:
+        if there < d - 1e-9 and (not level or dot(normal, n) > ALIKE):
             p, d, n = q, there, normal
         else:
             # A step by the distance itself leads to where two lines cross.

@@ -125,8 +125,9 @@ def highest(triangles, s, p, up, radius):
 
 
 @njit(**BARE)
-def lowest_corner(triangles, s, p, up, radius):
-    """The corner of shape s that is lowest along `up`, of those within a distance of p; p if none is lower."""
+def lowest_corner(triangles, s, p, up, radius, slope):
+    """The corner of shape s that is lowest along `up`, of those within a distance of p that lie no steeper below it
+    than a slope; p if none is lower."""
     if triangles.level[s] < 0:
         return p
     level, first, root = triangles.level[s], triangles.first[s], triangles.root[s]
@@ -144,7 +145,8 @@ def lowest_corner(triangles, s, p, up, radius):
             for t in range(first + (count * leaf >> level), first + (count * (leaf + 1) >> level)):
                 for k in range(3):
                     corner = get(triangles.corner[t], k)
-                    if dot(up, corner) < low and norm(sub(corner, p)) < radius:
+                    away = norm(sub(corner, p))
+                    if dot(up, corner) < low and away < radius and dot(up, sub(p, corner)) <= slope * away:
                         low, place = dot(up, corner), corner
         i += 1
         while i & 1 == 0:
