@@ -235,11 +235,13 @@ def rocking(at: Setting) -> Iterator[Check]:
     lean = 20.0
     for kind in ("mesh", "grid"):
         half_ball = mesh_shape(revolve(profile, 96), name="half ball", kind=kind)
+        # Of its mass: how far it is below the middle of the ball, and its inertia for a mass of 1.
         low, inertia = -half_ball.com[2], half_ball.inertia[0, 0] / half_ball.volume
         for mu in (0.0, 1.0):
 
             def pace(angle: float, mu: float = mu, low: float = low, inertia: float = inertia) -> float:
-                """Speed of the angle, over that of a fall by one size, at unit length and gravity."""
+                """Turning speed at an angle, by energy, where the size and gravity are 1."""
+                # Squared distance of the mass from the point at rest: the lowest one, or, without friction, below it.
                 arm = 0.25 + low**2 - low * cos(angle) if mu else (low * sin(angle)) ** 2
                 return sqrt(2 * low * (cos(angle) - cos(radians(lean))) / (inertia + arm))
 
@@ -249,8 +251,8 @@ def rocking(at: Setting) -> Iterator[Check]:
             ran = run(at, f"{kind}, mu = {mu:g}", [put, floor()], 10 * period)
             swing, time = ran.turn("it").apply([0, 0, 1])[:, 0], ran.seconds
             down = np.flatnonzero((swing[:-1] > 0) & (swing[1:] <= 0))
-            first = time[down] + swing[down] / (swing[down] - swing[down + 1]) * (time[down + 1] - time[down])
-            yield ran.near("period", float(np.diff(first).mean()), period, 0.03, "s")
+            crossed = time[down] + swing[down] / (swing[down] - swing[down + 1]) * (time[down + 1] - time[down])
+            yield ran.near("period", float(np.diff(crossed).mean()), period, 0.03, "s")
             energy = ran.energy()
             swings = put.dense * DENSITY * half_ball.volume * at.size**4 * G * low * (1 - cos(radians(lean)))
             yield ran.most("energy gained", (energy - np.minimum.accumulate(energy)).max() / swings, 0.06)

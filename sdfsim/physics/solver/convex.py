@@ -231,7 +231,7 @@ def _squared(convex, matrix, pair, n, s, thick):
                     found = separation(convex, matrix, pair, m)
                     if found >= s - AS_MUCH * thick:
                         return m, found
-        if kind == BLOCK or kind == DRUM or kind == CONE:
+        elif kind == BLOCK or kind == DRUM or kind == CONE:
             flat = abs(z) > ALONG or (kind == BLOCK and (abs(x) > ALONG or abs(y) > ALONG))
             if flat:
                 m = turn(matrix, body, (float(round(x)), float(round(y)), float(round(z))))
