@@ -124,6 +124,28 @@ def test_frames_that_repeat_others_are_left_out():
     assert true_times(time[:50], taken)[1].tolist() == list(range(50))
 
 
+def test_a_copy_in_place_of_a_lost_frame_leaves_the_times_of_others():
+    taken = np.random.default_rng(0).integers(0, 255, (40, 12, 16, 3)).astype(np.uint8)
+    order = np.arange(40)
+    order[[5, 9, 26, 31]] -= 1
+    true, kept, notes = true_times(order / 30, taken[order])
+    assert kept.tolist() == [k for k in range(40) if k not in (5, 9, 26, 31)]
+    assert np.array_equal(true, order[kept] / 30)
+    assert "4 of 40 frames" in notes[0]
+
+
+def test_no_frame_of_slow_motion_counts_as_a_repetition():
+    """Compression and lamps change whole pictures by more than what moves slowly."""
+    rng = np.random.default_rng(0)
+    taken = np.full((60, 48, 64, 3), 100.0)
+    for k in range(60):
+        taken[k] += rng.normal(0, (0.2, 3.0)[k % 2]) + rng.normal(0, (0.1, 2.0)[k % 2], taken[k].shape)
+        x = 20 + 15 * np.sin(2 * np.pi * (k - 0.5) / 30)
+        inside = np.clip(np.minimum(np.arange(64) + 1 - x, x + 12 - np.arange(64)), 0, 1)[:, None]
+        taken[k, 20:32] = inside * 20 + (1 - inside) * taken[k, 20:32]
+    assert len(true_times(np.arange(60) / 60, taken.astype(np.uint8))[1]) == 60
+
+
 def steady(place: list[float]):
     return lambda time: (np.array([[0, 0, 0], place]), np.array([LEVEL, LEVEL]))
 

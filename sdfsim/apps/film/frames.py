@@ -14,7 +14,10 @@ from sdfsim.base.parallel import Progress, silent
 WIDE = 640  # px: larger pictures are made smaller
 MOST = 1500  # frames that are kept in memory
 LEAST = 8
-SAME = 0.3  # of the usual change between frames: less is a repetition
+# Of the changes before and after, of what changes most, and of all of the picture: less is a repetition.
+SAME = 0.65, 0.3
+MISSED = 0.3  # of the usual spacing: a frame after less is not the next one
+MOVING = 20  # px at least, of the parts of pictures that change most
 EVEN = 0.05  # of the spacing: times that are off by less are even
 
 
@@ -76,24 +79,36 @@ def read_clip(
 def true_times(time: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
     """Times [K] s of frames, the frames [K] that were kept, and notes.
 
-    No camera gives the same picture twice: noise differs. If single frames repeat the one before, the film was copied
-    at another rate, and its times are those of the copy; the camera's own are even.
+    A frame repeats the one before if nothing moves in it while things move before and after. Where this recurs evenly,
+    the film was copied at another rate: its times are those of the copy, and the camera's own are even. Other copies
+    fill gaps of the camera, and the times of other frames are right.
     """
     small = pixels[:, ::2, ::2].astype(np.int16)
-    change = np.array([np.abs(now - before).mean() for before, now in pairwise(small)])
-    small = np.r_[False, change < SAME * np.median(change)]
-    alone = small & ~np.r_[False, small[:-1]] & ~np.r_[small[1:], False]
-    every = np.arange(len(time))
-    if alone.sum() < 2 or (small & ~alone).any():  # at rest many frames in a row are alike
-        return time, every, ()
-    kept = every[~alone]
+    change = np.array([np.abs(now - before).max(-1) for before, now in pairwise(small)]).reshape(len(time) - 1, -1)
+    most = max(MOVING, change.shape[1] // 500)
+    fast = np.partition(change, -most, axis=1)[:, -most:]
+    # What moves changes a part of the picture; noise and lamps change all of it.
+    both = np.stack([fast.mean(1), change.mean(1)])
+    around = np.minimum(np.c_[[np.inf] * 2, both[:, :-1]], np.c_[both[:, 1:], [np.inf] * 2])
+    again = 1 + np.flatnonzero((both < np.array(SAME)[:, None] * around).all(0))
+    kept = np.setdiff1d(np.arange(len(time)), again)
+    told = f"{len(again)} of {len(time)} frames repeat others"
+    if not _even(again):
+        return time[kept], kept, (f"{told} and are left out",) if len(again) else ()
     gaps = np.diff(time[kept])
     step = float(gaps.mean())
-    number = np.r_[0, np.cumsum([1 if SAME * step < gap < 2.5 * step else round(gap / step) for gap in gaps])]
+    number = np.r_[0, np.cumsum([1 if MISSED * step < gap < 2.5 * step else round(gap / step) for gap in gaps])]
     last = np.r_[number[1:] != number[:-1], True]  # a repetition that compression hid comes just before the next frame
     kept, number = kept[last], number[last]
     step, first = np.polyfit(number, time[kept], 1)
-    note = (
-        f"{len(time) - len(kept)} of {len(time)} frames repeat others: frames are taken to be 1/{1 / step:.4g} s apart"
-    )
-    return first + step * number, kept, (note,)
+    return first + step * number, kept, (f"{told}: frames are taken to be 1/{1 / step:.4g} s apart",)
+
+
+def _even(rows: np.ndarray) -> bool:
+    """Whether numbers recur evenly, apart from some that are missing."""
+    gaps = np.diff(rows)
+    if len(gaps) < 3:
+        return False
+    period = float(np.median(gaps[gaps <= 1.5 * gaps.min()]))
+    fits = np.abs(gaps - period * np.round(gaps / period)) <= 1.0
+    return bool(fits.mean() > 0.9 and len(gaps) > 0.7 * gaps.sum() / period)
