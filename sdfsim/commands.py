@@ -290,7 +290,11 @@ def identify(
     start: Annotated[float | None, typer.Option(help="Of a film: where to begin, s.", show_default=False)] = None,
     end: Annotated[float | None, typer.Option(help="Of a film: where to end, s.", show_default=False)] = None,
     body: Annotated[
-        list[str] | None, typer.Option(help="Of a film: a body that moves in it; repeat it (default: all that move).")
+        list[str] | None,
+        typer.Option(
+            help="Of a film: a body that moves in it, or a static one that is moved along; repeat it (default: all "
+            "that move)."
+        ),
     ] = None,
     allow_outside: Outside = False,
 ) -> None:
@@ -305,16 +309,17 @@ def identify(
         check_writable(out.parent)
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
     if any(path.suffix.lower() in FILMS for path in recordings):
-        from sdfsim.apps.film.film import identify_clips, only_moving
+        from sdfsim.apps.film.film import identify_clips
         from sdfsim.scene.load import load_scene
 
         if scene is None or not all(path.suffix.lower() in FILMS for path in recordings):
             raise SdfsimError("films need their scene, and no other recordings beside them", "--scene scene.yaml")
-        known = only_moving(load_scene(scene, shapes, allow_outside=allow_outside), body or [])
+        known = load_scene(scene, shapes, allow_outside=allow_outside)
         beside = None if out is None else out.with_name("beside.mp4")
         seen = identify_clips(
-            recordings, known, points=points, slow=slow, start=start, end=end, beside=beside, on_progress=fit
-        )
+            recordings, known, points=points, slow=slow, start=start, end=end, bodies=body or [], beside=beside,
+            on_progress=fit,
+        )  # fmt: skip
         lines, wrote = report_lines(seen), {} if out is None else {"wrote": out, "beside": beside}
         if out is not None:
             lines += [*write_scene(seen, scene, out), f"wrote {out}", f"wrote {beside}: the fit's motion over the film"]

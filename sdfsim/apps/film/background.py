@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,10 +28,12 @@ class Background:
     last: np.ndarray
     noise: float  # levels, standard deviation of a pixel
     gain: np.ndarray  # [T] brightness of the frames
+    front: Callable[[np.ndarray, int], np.ndarray] = lambda still, _: still  # draws supports where they are in a frame
 
 
-def background(clip: Clip, hidden: Sequence[np.ndarray | None] | None = None) -> Background:
-    """The median of frames, without the pixels that bodies `hidden` ([T] masks [H, W] each) cover."""
+def background(clip: Clip, hidden: Sequence[np.ndarray | None] | None = None, complete: bool = True) -> Background:
+    """The median of frames, without the pixels that bodies `hidden` ([T] masks [H, W] each) cover; `complete`: nothing
+    else moves."""
     count = len(clip.time)
     some = np.unique(np.linspace(0, count - 1, FEW).astype(int))
     gain = np.ones(count)
@@ -42,23 +44,36 @@ def background(clip: Clip, hidden: Sequence[np.ndarray | None] | None = None) ->
         bright = usual > 20.0
         gain[k] = np.median(now[bright] / usual[bright]) if bright.sum() > 50 else 1.0
     part = max(3, count * 3 // 10)
-    first, last = (np.median(clip.pixels[rows][:: max(1, part // 15)], 0).astype(np.float32)
-                   for rows in (slice(0, part), slice(count - part, count)))  # fmt: skip
-    differ = np.abs(first - last).max(-1) > DIFFER
-    pixels = np.where(differ[..., None], np.nan, usual_of).astype(np.float32)
-    if hidden is not None:
-        touched = np.logical_or.reduce([hidden[k] for k in some if hidden[k] is not None])
-        seen = clip.pixels[some][:, touched] / gain[some, None, None].astype(np.float32)
-        for row, k in enumerate(some):
-            if hidden[k] is not None:
-                seen[row][hidden[k][touched]] = np.nan
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # where a body always was
-            usual_of[touched] = np.nanmedian(seen, 0)
+    ends = [rows[:: max(1, part // 15)] for rows in (np.arange(part), np.arange(count - part, count))]
+    if hidden is None:
+        first, last = (np.median(clip.pixels[rows], 0).astype(np.float32) for rows in ends)
+    else:
+        usual_of, first, last = (_median(clip, rows, gain, hidden) for rows in (some, *ends))
+        first, last = (np.where(np.isnan(one), usual_of, one) for one in (first, last))
+    if hidden is not None and complete:
         first = last = pixels = usual_of
+    else:
+        differ = np.abs(first - last).max(-1) > DIFFER
+        pixels = np.where(differ[..., None], np.nan, usual_of).astype(np.float32)
     still = np.abs(np.diff(clip.pixels[some][:, ::4, ::4].astype(np.float32), axis=0))
     noise = max(LEAST_NOISE, 1.48 * float(np.median(still)) / np.sqrt(2.0))
     return Background(pixels, first, last, noise, gain)
+
+
+def _median(clip: Clip, rows: np.ndarray, gain: np.ndarray, hidden: Sequence[np.ndarray | None]) -> np.ndarray:
+    """[H, W, 3] the median of these frames, nan where something is always hidden."""
+    found = np.median(clip.pixels[rows], 0).astype(np.float32)
+    covers = [(row, cover) for row, k in enumerate(rows) if (cover := hidden[k]) is not None]
+    if not covers:
+        return found
+    touched = np.logical_or.reduce([cover for _, cover in covers])
+    seen = clip.pixels[rows][:, touched] / gain[rows, None, None].astype(np.float32)
+    for row, cover in covers:
+        seen[row][cover[touched]] = np.nan
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # where a body always was
+        found[touched] = np.nanmedian(seen, 0)
+    return found
 
 
 def checked(clip: Clip, back: Background) -> None:

@@ -19,9 +19,10 @@ Pose = tuple[np.ndarray, np.ndarray]
 def drawn(film: Film, k: int, made: Callable[[int, int], Pose | None]) -> np.ndarray:
     """Frame k [H, W, 3] with the outlines of the bodies: as seen, and where `made` (frame, body) says."""
     pixels = np.ascontiguousarray(film.clip.pixels[k])
-    for d, track in enumerate(film.tracks):
+    for d, track in enumerate([*film.tracks, *film.supports]):
         one = track.seen[k]
-        for now, color in ((one and (one.place, one.turn), SEEN), (made(k, d), MADE)):
+        fit = made(k, d) if d < len(film.tracks) else None
+        for now, color in ((one and (one.place, one.turn), SEEN), (fit, MADE)):
             at = now and track.look.window(film.eye, *now, 3.0)
             if now is None or at is None:
                 continue

@@ -21,6 +21,7 @@ FLIGHT = 0.22  # s, of pieces in which a ball is taken to fly
 FITS = 4.0  # mean of squares up to which a piece is a flight
 LEVEL = 0.4  # rad, how much phones are tilted up or down
 LEAST = 4  # points
+BY_FALLING = "a falling ball"  # where such a camera comes from
 WRONG = 8.0  # px, of points that do not fit together
 UNSURE = 10.0  # how many standard deviations gravity must be from nothing in a piece
 SCALE = 0.75, 1.35  # accelerations relative to gravity beyond which a piece is no flight
@@ -88,7 +89,7 @@ def level(clip: Clip) -> Eye:
     """A camera at the origin that looks along y, of a usual phone: what is taken before anything is known."""
     high, wide = clip.pixels.shape[1:3]
     turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
-    return Eye(turn, np.zeros(3), LENS[0] * max(wide, high), wide, high, np.zeros((WAYS, 0)), "a falling ball")
+    return Eye(turn, np.zeros(3), LENS[0] * max(wide, high), wide, high, np.zeros((WAYS, 0)), BY_FALLING)
 
 
 def of_ball(

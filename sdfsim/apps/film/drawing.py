@@ -40,6 +40,7 @@ class Look:
 
     def __init__(self, scene: Scene, body: Body) -> None:
         shape = scene.shapes[body.shape]
+        self.name, self.support = body.name, body.motion != "dynamic"
         self.com = body.scale * shape.com
         self.ball = shape.sdf.radius * body.scale if isinstance(shape.sdf, SphereSdf) else 0.0
         vertices = body.scale * (shape.mesh.vertices - shape.com)

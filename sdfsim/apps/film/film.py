@@ -10,12 +10,13 @@ import numpy as np
 
 from sdfsim.apps.film.background import background, checked
 from sdfsim.apps.film.beside import write_beside
-from sdfsim.apps.film.camera import in_world, level, of_ball, of_points, read_points
+from sdfsim.apps.film.camera import BY_FALLING, in_world, level, of_ball, of_points, read_points
 from sdfsim.apps.film.drawing import Look
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.frames import Clip, read_clip
 from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
+from sdfsim.apps.film.supports import behind_others, supported, with_paths
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
 from sdfsim.apps.identify.filmed import identify_films
 from sdfsim.apps.identify.report import Identified
@@ -23,7 +24,7 @@ from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.scene.builder import SceneBuilder, loaded
-from sdfsim.scene.scene import Scene
+from sdfsim.scene.scene import Scene, Waypoints
 
 FITS = 0.6  # score that most frames of a body of the right shape have
 ENOUGH = 8  # frames in which a body must be seen
@@ -33,30 +34,34 @@ GONE = 0.25  # share of the frames after which a body may be out of the picture
 
 def track(
     clip: Path | str, scene: Scene | SceneBuilder | Path | str, *, points: Path | str | None = None, slow: float = 1.0,
-    start: float | None = None, end: float | None = None, on_progress: Progress = silent,
+    start: float | None = None, end: float | None = None, bodies: Sequence[str] = (), on_progress: Progress = silent,
 ) -> Recording:  # fmt: skip
     """Where the moving bodies of a scene were in a film of a fixed camera, with an uncertainty of each pose.
 
     The camera is found from `points` of known places (a YAML file, see docs/identify.md), from the photos of a scene
     that `sdfsim reconstruct` made, or from a single ball that bounces on level ground. `slow`: how many times slower
-    the film plays than things moved; `start` and `end` s: the part of the film. Raises SdfsimError for films in which
-    the bodies cannot be tracked.
+    the film plays than things moved; `start` and `end` s: the part of the film; `bodies`: names of those that move in
+    it (all moving bodies of the scene if none of these is named), and of static ones that are moved along, as a plank
+    that is tilted. Raises SdfsimError for films in which the bodies cannot be tracked.
     """
     return watched(
-        Path(clip), loaded(scene), points=points, slow=slow, start=start, end=end, on_progress=on_progress
-    ).recording
+        Path(clip), loaded(scene), points=points, slow=slow, start=start, end=end, bodies=bodies,
+        on_progress=on_progress,
+    ).recording  # fmt: skip
 
 
 def watched(
     path: Path, scene: Scene, *, points: Path | str | None = None, slow: float = 1.0, start: float | None = None,
-    end: float | None = None, on_progress: Progress = silent,
+    end: float | None = None, bodies: Sequence[str] = (), on_progress: Progress = silent,
 ) -> Film:  # fmt: skip
     """As `track`, with everything else that was found."""
+    names, scene = bodies, with_moving(scene, bodies)
     clip = read_clip(path, slow=slow, start=start, end=end, on_progress=on_progress)
     back = background(clip)
     checked(clip, back)
-    bodies, size = movers(scene), (clip.pixels.shape[2], clip.pixels.shape[1])
-    looks = [Look(scene, body) for body in bodies]
+    moving, size = movers(scene), (clip.pixels.shape[2], clip.pixels.shape[1])
+    looks = [Look(scene, body) for body in moving]
+    led = [body for body in scene.bodies if body.motion == "kinematic" and body.name in names]
     room = photos_of(scene.path)
     if points is not None:
         pixels, places, focal = read_points(Path(points))
@@ -64,7 +69,7 @@ def watched(
     elif room is not None:
         still = np.median(clip.pixels[:: max(1, len(clip.time) // 15)], 0).astype(np.uint8)
         eye = of_points(*of_room(still, room, str(path)), None, size, f"the photos of {room}")
-    elif len(looks) == 1 and looks[0].ball:
+    elif len(looks) == 1 and looks[0].ball and not led:
         eye = level(clip)
     else:
         raise SdfsimError(
@@ -72,15 +77,21 @@ def watched(
             "give points of known places: --points points.yaml (docs/identify.md)",
         )
     shutter, tracks, gravity = Shutter(0.5 * clip.step, 0.7), [], np.asarray(scene.gravity)
-    for body, look in zip(bodies, looks, strict=True):
+    supports = supported(clip, back, eye, [Look(scene, body) for body in led], led, shutter, on_progress)
+    if supports:
+        supports, back = behind_others(clip, eye, supports, shutter)
+    for body, look in zip(moving, looks, strict=True):
         place = body.position + look.com
-        k, first = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(bodies) == 1)
+        k, first = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(moving) == 1)
         tracks.append(follow(clip, back, look, eye, shutter, k, first, gravity, on_progress=on_progress))
         _judged(clip, tracks[-1], body.name)
     shutter = shutter_of(clip, back, eye, tracks[0])
     covered = [masks(clip, eye, one) for one in tracks]
     every = [_either([of[k] for of in covered]) for k in range(len(clip.time))]
-    back = background(clip, every)
+    if supports:
+        supports, back = behind_others(clip, eye, supports, shutter, every)
+    else:
+        back = background(clip, every)
     refined = []
     for d, one in enumerate(tracks):
         others = [_either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
@@ -88,10 +99,11 @@ def watched(
         full = follow(clip, back, one.look, eye, shutter, k, one.at(k), gravity, others, on_progress)
         refined.append(deepened(clip, eye, again(clip, back, eye, shutter, full, others)))
     tracks = refined
-    for body, one in zip(bodies, tracks, strict=True):
+    for body, one in zip([*led, *moving], [*supports, *tracks], strict=True):
         _judged(clip, one, body.name)
+    for body, one in zip(moving, tracks, strict=True):
         _stays(clip, eye, one, body.name)
-    if points is None and room is None:
+    if eye.source == BY_FALLING:
         look = looks[0]
         below = [
             b.position[2] + b.scale * scene.shapes[b.shape].sdf.bounds[1, 2]
@@ -99,28 +111,34 @@ def watched(
             if b.motion == "static"
         ]
         ground = max([z if np.isfinite(z) else 0.0 for z in below], default=0.0) + look.ball
-        eye, turn, shift = of_ball(clip, eye, tracks[0].seen, np.asarray(scene.gravity), bodies[0].position, ground)
+        eye, turn, shift = of_ball(clip, eye, tracks[0].seen, np.asarray(scene.gravity), moving[0].position, ground)
         moved = [one and in_world(one, turn, shift) for one in tracks[0].seen]
         tracks = [deepened(clip, eye, again(clip, back, eye, shutter, Track(look, moved)))]
     notes = [*clip.notes, f"shutter open for {1e3 * shutter.open:.2g} ms, smeared by {shutter.spread:.2g} px"]
-    return Film(clip, back, shutter, eye, tracks, recording_of(clip, eye, tracks, scene), notes)
+    scene = with_paths(clip, scene, supports, [body.name for body in led])
+    return Film(clip, back, shutter, eye, tracks, supports, scene, recording_of(clip, eye, tracks, scene), notes)
 
 
 def identify_clips(
     paths: Sequence[Path], scene: Scene, *, points: Path | None = None, slow: float = 1.0, start: float | None = None,
-    end: float | None = None, beside: Path | None = None, on_progress: Progress = silent,
+    end: float | None = None, bodies: Sequence[str] = (), beside: Path | None = None, on_progress: Progress = silent,
 ) -> Identified:  # fmt: skip
     """Parameters of a scene from films of it, see `track`; with `beside`, a movie of the first film with the outlines
-    of the fit's motion."""
+    of the fit's motion. Raises SdfsimError also for several films of a support that is moved."""
     films = [
-        watched(path, scene, points=points, slow=slow, start=start, end=end, on_progress=on_progress) for path in paths
+        watched(path, scene, points=points, slow=slow, start=start, end=end, bodies=bodies, on_progress=on_progress)
+        for path in paths
     ]
+    if len(films) > 1 and films[0].supports:
+        raise SdfsimError("a support moves in its own way in each film", "identify from one film at a time")
     for _ in range(AGAIN):
-        found, motion, changes = identify_films([film.recording for film in films], scene, on_progress=on_progress)
+        found, motion, changes = identify_films(
+            [film.recording for film in films], films[0].scene, on_progress=on_progress
+        )
         films, start_of = [*films], 0
         for n, film in enumerate(films):  # the camera as the motion shows it; its effect is only linear nearby
             stop = start_of + film.eye.doubt.shape[1]
-            films[n], start_of = _seen_by(film, film.eye.moved(film.eye.doubt @ changes[start_of:stop]), scene), stop
+            films[n], start_of = _seen_by(film, film.eye.moved(film.eye.doubt @ changes[start_of:stop])), stop
         if np.abs(changes).max(initial=0.0) < SETTLED:
             break
     if beside is not None:
@@ -136,30 +154,45 @@ def identify_clips(
     return replace(found, notes=[*found.notes, *notes])
 
 
-def _seen_by(film: Film, eye: Eye, scene: Scene) -> Film:
+def _seen_by(film: Film, eye: Eye) -> Film:
     """The film with another camera: the same pictures, and so bodies where they then have to be."""
-    tracks, was = [], film.eye
-    for one in film.tracks:
+    placed, was = [], film.eye
+    for one in (*film.tracks, *film.supports):
         seen = list(one.seen)
         for k in one.frames.tolist():
             local = was.seen(seen[k].place) * (eye.focal / was.focal)
             local[:2] *= was.focal / eye.focal
             seen[k] = replace(seen[k], place=(local - eye.translation) @ eye.rotation)
-        tracks.append(deepened(film.clip, eye, again(film.clip, film.back, eye, film.shutter, Track(one.look, seen))))
-    return replace(film, eye=eye, tracks=tracks, recording=recording_of(film.clip, eye, tracks, scene))
+        placed.append(Track(one.look, seen))
+    tracks, supports, back, scene = placed[: len(film.tracks)], placed[len(film.tracks) :], film.back, film.scene
+    if supports:
+        covered = [masks(film.clip, eye, one) for one in tracks]
+        every = [_either([of[k] for of in covered]) for k in range(len(film.clip.time))]
+        supports, back = behind_others(film.clip, eye, supports, film.shutter, every)
+        scene = with_paths(film.clip, scene, supports, [one.look.name for one in supports])
+    tracks = [deepened(film.clip, eye, again(film.clip, back, eye, film.shutter, one)) for one in tracks]
+    recording = recording_of(film.clip, eye, tracks, scene)
+    return replace(film, back=back, eye=eye, tracks=tracks, supports=supports, scene=scene, recording=recording)
 
 
-def only_moving(scene: Scene, names: Sequence[str]) -> Scene:
-    """The scene with only these of the moving bodies; all if none is named. Raises SdfsimError for a name that it does
-    not have."""
-    moving = [body.name for body in movers(scene)]
+def with_moving(scene: Scene, names: Sequence[str]) -> Scene:
+    """The scene with only these of the moving bodies (all if none of them is named), and with static ones of these
+    names as bodies on paths. Raises SdfsimError for a name that it does not have."""
+    known = {body.name: body.motion for body in scene.bodies if np.isfinite(scene.shapes[body.shape].sdf.bounds).all()}
     for name in names:
-        if name not in moving:
+        if name not in known:
             raise SdfsimError(
-                f"--body {name}: no moving body of the scene{nearest(name, moving)}", f"it has {', '.join(moving)}"
+                f"--body {name}: no body of the scene{nearest(name, list(known))}", f"it has {', '.join(known)}"
             )
-    bodies = tuple(body for body in scene.bodies if not names or body.motion != "dynamic" or body.name in names)
-    return replace(scene, bodies=bodies) if names else scene
+    chosen = any(known[name] == "dynamic" for name in names)
+    bodies = []
+    for body in scene.bodies:
+        if body.name in names and body.motion == "static":
+            path = Waypoints(np.zeros(1), body.position[None], body.quat_xyzw[None])
+            bodies.append(replace(body, motion="kinematic", path=path))
+        elif not chosen or body.motion != "dynamic" or body.name in names:
+            bodies.append(body)
+    return replace(scene, bodies=tuple(bodies)) if names else scene
 
 
 def _either(found: list[np.ndarray | None]) -> np.ndarray | None:

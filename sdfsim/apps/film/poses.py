@@ -22,7 +22,7 @@ ODD = 3.0  # standard deviations beyond which a pixel counts less
 MARGIN = 5.0  # px around a body that are compared
 FREE = 12.0  # levels by which a colour may differ from that in other frames
 SMEARED = 4.0  # radii: the longest smear
-LARGEST = 400  # px, sides of the part of a picture that is compared
+LARGEST = 640  # px, sides of the part of a picture that is compared
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -227,8 +227,9 @@ def _seen(seen: Comparison, place, turn, color, rest, weight, slope, normal, pul
     full = np.zeros((6, 6))
     full[: look.ways, : look.ways] = root
     large, small = (np.abs(seen.off) ** 2).mean(-1), (rest**2).mean(-1) * seen.noise**2
-    total = float((large * seen.weight).sum())
-    score = 1.0 - float((small * seen.weight).sum()) / max(total, 1e-9)
+    counts = weight if look.support else seen.weight  # what lies on a support is not explained by it
+    total = float((large * counts).sum())
+    score = 1.0 - float((small * counts).sum()) / max(total, 1e-9)
     if total < 4.0 * seen.noise**2 * seen.weight.size:
         score = min(score, 0.0)
     return Seen(place, turn, full @ np.linalg.inv(to_world), full[:, : look.ways] @ off,

@@ -18,6 +18,7 @@ from sdfsim.apps.observed import Recording
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
+from sdfsim.scene.scene import Scene
 
 STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things that move there, and orientations
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
@@ -58,13 +59,16 @@ class Film:
     shutter: Shutter
     eye: Eye
     tracks: list[Track]  # of the moving bodies
+    supports: list[Track]  # of bodies that are moved along
+    scene: Scene  # with the supports' paths
     recording: Recording
     notes: list[str]
 
 
 def frame_of(clip: Clip, back: Background, k: int, hidden: np.ndarray | None = None, way: int = 0) -> Frame:
     """Frame k, with the background that is free of the body later (`way` 1), earlier (-1), or both (0)."""
-    return Frame(clip.pixels[k], (back.pixels, back.first, back.last)[way], float(back.gain[k]), back.noise, hidden)
+    still = back.front((back.pixels, back.first, back.last)[way], k)
+    return Frame(clip.pixels[k], still, float(back.gain[k]), back.noise, hidden)
 
 
 def blobs(frame: Frame, others: Sequence[np.ndarray] = ()) -> list[tuple[np.ndarray, float]]:
@@ -179,7 +183,7 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
     tries: list[tuple[Any, ...]] = [(*guess, 0.0) for guess in predicted(clip, eye, shutter, at, before, gravity)]
     tries += [(*guess, 2.5) for *guess, _ in tries]
     depth = float(eye.seen(before[0][1].place)[2])
-    for blob, _ in blobs(frame)[:2]:  # something pushed it: it may be anywhere, and rebound
+    for blob, _ in [] if look.support else blobs(frame)[:2]:  # something pushed it: it may be anywhere, and rebound
         there = (eye.rays(*blob) * depth - eye.translation) @ eye.rotation
         tries += [(there, tries[0][1], flow, 2.5) for flow in (np.zeros(2), tries[0][2] * REBOUND)]
     for place, turn, flow, wide in tries:
@@ -222,7 +226,9 @@ def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray,
 
 
 def at_edge(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> bool:
-    """Whether a part of it is outside of the picture."""
+    """Whether a part of it is outside of the picture; supports may reach beyond it."""
+    if look.support:
+        return False
     at = look.window(eye, place, turn, 1.0)
     return at is None or at.left <= 0 or at.top <= 0 or at.right >= eye.width or at.bottom >= eye.height
 

@@ -97,7 +97,8 @@ class Shots:
         """[C, L + 1, D, 3] and [C, L + 1, D, 4] from C starts, which are windows times variants."""
         count, u = len(starts.position), self.problem.units
         if count not in self._copies:
-            self._copies[count] = Copies(self.problem.scene, count)
+            begin = [self.dt * t for _, t in self.begin] * (count // len(self.begin))
+            self._copies[count] = Copies(self.problem.scene, count, begin)
         copies, dt = self._copies[count], self.dt / u.time
         first = [
             a.reshape(count * self.many, -1)

@@ -219,6 +219,14 @@ class Problem:
                     turn = turn + value * axis
         return pose.from_rotvec(turn), shift
 
+    def displaced(self, values: np.ndarray, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """How a body on a path is displaced in its own axes, as a static one at its place in the scene would be: shift,
+        model units, and rotation (a quaternion)."""
+        (turn, shift), of = self.lie(values, body), self.bodies[body]
+        back, place, centre = pose.conjugate(of.quat_xyzw), of.position / self.units.length, self.ground[body].centre
+        way = pose.rotate(back, centre - place + pose.rotate(turn, place - centre) + shift)
+        return way, pose.multiply(back, pose.multiply(turn, of.quat_xyzw))
+
     def rows(self, body: int, count: int) -> Any:
         """Where one of `bodies` is among those of `Copies`."""
         many, led = len(self.moving), len(self.led)
@@ -260,7 +268,7 @@ class Problem:
         for body, ground in self.ground.items():
             rows, (turn, shift) = self.rows(body, count), self.lie(values, body)
             if body < len(self.moving) + len(self.led):
-                tracks = _displaced(tracks, self.bodies[body], rows, ground.centre, turn, shift, self.units.length)
+                tracks = _displaced(tracks, rows, *self.displaced(values, body))
                 continue
             row = rows
             position[row] = ground.centre + pose.rotate(turn, position[row] - ground.centre) + shift
@@ -270,15 +278,12 @@ class Problem:
         return replace(bodies, tracks=tracks, **new), replace(state, position=position, orientation=orientation)
 
 
-def _displaced(tracks, body: Body, rows: slice, centre, turn, shift, length: float) -> Tracks:
-    """The tracks with the body in these rows displaced in its own axes, as a static one at its place in the scene would
-    be: turned about the centre, and shifted."""
+def _displaced(tracks: Any, rows: slice, way: np.ndarray, turn: np.ndarray) -> Tracks:
+    """The tracks with the body in these rows displaced in its own axes."""
     some = np.flatnonzero((tracks.body >= rows.start) & (tracks.body < rows.stop))
-    back, place = pose.conjugate(body.quat_xyzw), body.position / length
-    way = pose.rotate(back, centre - place + pose.rotate(turn, place - centre) + shift)
     origin, orientation = tracks.origin.copy(), tracks.orientation.copy()
     origin[some] += pose.rotate(orientation[some], way)
-    orientation[some] = pose.multiply(orientation[some], pose.multiply(back, pose.multiply(turn, body.quat_xyzw)))
+    orientation[some] = pose.multiply(orientation[some], turn)
     return replace(tracks, origin=origin, orientation=orientation)
 
 

@@ -27,7 +27,8 @@ HEADS = {name: kind.head for name, kind in KINDS.items()}
 HEADS |= {"own_friction": "friction of its own", "own_restitution": "restitution of its own"}
 # Units for hinges and balls, and for sliders.
 OF_TURNS = {"joint_friction": (" N m", " N"), "joint_damping": (" N m s", " N s/m")}
-INSTEAD = {"mass": ("density",), "quat_xyzw": ("quat_wxyz", "euler_xyz_deg")}
+PLACE = ("position", "quat_xyzw", "quat_wxyz", "euler_xyz_deg")
+INSTEAD = {"mass": ("density",), "quat_xyzw": PLACE[2:], "path": PLACE}
 ACROSS = 4  # panels in a row
 PANEL = (3.0, 2.2)  # inches
 
@@ -246,11 +247,13 @@ def file_values(problem: Problem, values: np.ndarray) -> tuple[dict[str, dict[st
     for body, ground in problem.ground.items():
         b, (turn, shift) = problem.bodies[body], problem.lie(values, body)
         if b.path is not None:
-            path = [
-                {"time": t, "position": p, "quat_xyzw": q}
-                for t, p, q in zip(*(a.tolist() for a in vars(b.path).values()), strict=True)
-            ]
-            found.setdefault(b.name, {})["path"] = path
+            way, turn = problem.displaced(values, body)
+            origin = b.path.position + pose.rotate(b.path.quat_xyzw, way * length)
+            poses = zip(
+                b.path.time.tolist(), _rounded(origin), _rounded(pose.multiply(b.path.quat_xyzw, turn)), strict=True
+            )
+            path = [{"time": t, "position": p, "quat_xyzw": q} for t, p, q in poses]
+            found.setdefault(b.name, {}).update(motion="kinematic", path=path)
             continue
         centre = ground.centre * length
         position = centre + pose.rotate(turn, b.position - centre) + shift * length
@@ -282,7 +285,7 @@ def write_scene(found: Identified, scene_file: Path, out: Path) -> list[str]:
         for key, value in values.items():
             for other in INSTEAD.get(key, ()):
                 entry.pop(other, None)
-            entry[key] = _rounded(value)
+            entry[key] = value if key in ("motion", "path") else _rounded(value)
     for entry in scene.joints:
         entry |= {key: _rounded(value) for key, value in found.joint_values.get(entry["name"], {}).items()}
     scene.save(out)
