@@ -18,7 +18,7 @@ from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.supports import behind_others, supported, with_paths
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
-from sdfsim.apps.identify.filmed import identify_films
+from sdfsim.apps.identify.filmed import identify_films, motion_of
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError, nearest
@@ -28,7 +28,8 @@ from sdfsim.scene.scene import Scene, Waypoints
 
 FITS = 0.6  # score that most frames of a body of the right shape have
 ENOUGH = 8  # frames in which a body must be seen
-AGAIN, SETTLED = 4, 0.2  # rounds of the fit, and changes of the camera, in standard deviations, that end them
+AGAIN, SETTLED = 3, 0.2  # more rounds of the fit, and changes of the camera, in standard deviations, that end them
+WORSE = 1.2  # rise of the cost of a round that ended elsewhere
 GONE = 0.25  # share of the frames after which a body may be out of the picture
 
 
@@ -131,18 +132,23 @@ def identify_clips(
     ]
     if len(films) > 1 and films[0].supports:
         raise SdfsimError("a support moves in its own way in each film", "identify from one film at a time")
-    for _ in range(AGAIN):
-        found, motion, changes = identify_films(
-            [film.recording for film in films], films[0].scene, on_progress=on_progress
-        )
-        films, start_of = [*films], 0
-        for n, film in enumerate(films):  # the camera as the motion shows it; its effect is only linear nearby
-            stop = start_of + film.eye.doubt.shape[1]
-            films[n], start_of = _seen_by(film, film.eye.moved(film.eye.doubt @ changes[start_of:stop])), stop
-        if np.abs(changes).max(initial=0.0) < SETTLED:
+    fit = identify_films([film.recording for film in films], films[0].scene, on_progress=on_progress)
+    moved = np.zeros(len(fit.fit.camera))
+    for _ in range(AGAIN):  # the camera as the motion shows it; its effect is only linear nearby
+        if np.abs(fit.fit.camera).max(initial=0.0) < SETTLED:
             break
+        moved, begin, other = moved + fit.fit.camera, 0, []
+        for film in films:
+            change = fit.fit.camera[begin : begin + film.eye.doubt.shape[1]]
+            other.append(_seen_by(film, film.eye.moved(film.eye.doubt @ change)))
+            begin += len(change)
+        records = [film.recording for film in other]
+        closer = identify_films(records, other[0].scene, near=fit, moved=moved, on_progress=on_progress)
+        if closer.fit.cost > WORSE * fit.fit.cost:
+            break
+        films, fit = other, closer
     if beside is not None:
-        first = films[0]
+        first, motion = films[0], motion_of(fit.shots, fit.fit)
         row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
 
         def made(k: int, d: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -151,7 +157,7 @@ def identify_clips(
 
         write_beside(first, made, beside)
     notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
-    return replace(found, notes=[*found.notes, *notes])
+    return replace(fit.found, notes=[*fit.found.notes, *notes])
 
 
 def _seen_by(film: Film, eye: Eye) -> Film:

@@ -28,7 +28,7 @@ ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame 
 FAR = 6  # frames for which a lost body is looked for where it would fly
 TWIN = 0.85  # score of each of two things that may both be the body
 OTHER = 60.0  # levels by which a ball's colour never differs from that in other frames
-SHUTTERS = (0.0, 0.25, 0.5, 0.75, 1.0)  # of the time between frames
+SHUTTERS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of the time between frames
 SPREADS = (0.0, 0.6, 1.0, 1.6)  # px
 
 
@@ -270,8 +270,11 @@ def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
         found = again(clip, back, eye, trial, track, only=some)
         return float(np.median([one.mean**2 if (one := found.seen[k]) else 1e3 for k in some]))
 
-    best = min((Shutter(share * clip.step, 0.6) for share in SHUTTERS), key=rest)
-    return min((replace(best, spread=spread) for spread in SPREADS), key=rest)
+    best = Shutter(0.5 * clip.step, SPREADS[1])
+    for _ in range(2):  # each hides a little of the other
+        best = min((replace(best, open=share * clip.step) for share in SHUTTERS), key=rest)
+        best = min((replace(best, spread=spread) for spread in SPREADS), key=rest)
+    return best
 
 
 def deepened(clip: Clip, eye: Eye, track: Track) -> Track:

@@ -35,6 +35,7 @@ SIZE = 0.1  # m, of the bodies for which windows are as long as said
 STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
 # What is known without the film, standard deviations, in the units of `Parameter`.
 KNOWN = {"inertia": 0.05, "size": 0.01, "tilt": math.radians(1.0), "mass": 1.0}
+LEVEL = 0.005  # m, of heights
 SLACK = 0.004  # of coefficients, which no film is expected to show better
 LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
 WORST = 4  # frames that are named
@@ -182,13 +183,19 @@ class _Fit:
     mean: float = math.inf  # standard deviations, of the differences
 
 
+def known_before(problem: Problem) -> np.ndarray:
+    """[P] what is known of parameters without a film, standard deviations; infinite if nothing is."""
+    known = KNOWN | {"height": LEVEL / problem.units.length}
+    return np.array([known.get(p.kind, math.inf) for p in problem.parameters])
+
+
 class Fitting:
     """Least squares of the parameters, the camera, and the starts of windows."""
 
-    def __init__(self, shots: Shots) -> None:
-        self.shots, self.problem = shots, shots.problem
+    def __init__(self, shots: Shots, moved: np.ndarray | float = 0.0) -> None:
+        self.shots, self.problem, self.moved = shots, shots.problem, moved
         width = self.problem.width
-        known = [KNOWN.get(p.kind, math.inf) for p in self.problem.parameters]
+        known = known_before(self.problem)
         self.sure = 1.0 / np.maximum(known, 1e-9) * np.isfinite(known) + 1e-3 / width
         self.mean = self.problem.start.copy()
 
@@ -200,7 +207,7 @@ class Fitting:
         prior, _ = self.shots.priors(fit.starts)
         own = self.sure * (fit.values - self.mean)
         cost = 6.0 * ODD**2 * float(np.log1p(square / ODD**2).sum()) + float(
-            (prior**2).sum() + (own**2).sum() + (fit.camera**2).sum()
+            (prior**2).sum() + (own**2).sum() + ((fit.camera + self.moved) ** 2).sum()
         )
         mean = float(np.sqrt(np.median(square[seen])))
         return off, 1.0 / np.sqrt(1.0 + square / ODD**2), cost, mean
@@ -268,7 +275,7 @@ class Fitting:
     def sureness(self, fit: _Fit) -> tuple[np.ndarray, np.ndarray]:
         """What is known of shared numbers without the film: weights, and how far they are off."""
         weight = np.r_[self.sure, np.ones(len(fit.camera))]
-        return weight, np.r_[fit.values - self.mean, fit.camera]
+        return weight, np.r_[fit.values - self.mean, fit.camera + self.moved]
 
     def step(self, fit: _Fit, rest, own, shared, damping: float) -> tuple[np.ndarray, np.ndarray]:
         ato = np.einsum("wri,wrj->wij", own, own)
@@ -300,16 +307,45 @@ def first_frames(r: Recording, length: int) -> list[int]:
     return found
 
 
+@dataclass(frozen=True)
+class Filmed:
+    """What films show."""
+
+    found: Identified
+    shots: Shots
+    fit: _Fit  # its `camera` [C]: how the cameras of all films were changed, in standard deviations
+    values: dict[tuple[str, str], float]  # of parameters, by kind and name
+
+
 def identify_films(
-    recordings: Sequence[Recording], scene: Scene, *, on_progress: Progress = silent
-) -> tuple[Identified, dict[tuple[int, int], tuple[np.ndarray, np.ndarray]], np.ndarray]:
-    """As `identify`, for recordings with `root`. Also returns the motion of the fit, see `motion_of`, and how the
-    cameras of all films were changed [C], in standard deviations.
+    recordings: Sequence[Recording], scene: Scene, *, near: Filmed | None = None, moved: np.ndarray | float = 0.0,
+    on_progress: Progress = silent,
+) -> Filmed:  # fmt: skip
+    """As `identify`, for recordings with `root`; `near`: what was found with cameras that were about right, and `moved`
+    [C]: how far they have been changed since they were known from the film, in standard deviations.
 
     Raises SdfsimError for recordings that are too short, or in which nothing touches.
     """
     problem = Problem(recordings, scene)
-    dt = recordings[0].dt
+    if near is None:
+        fitting, best = _from_nothing(problem, on_progress)
+    else:
+        shots = Shots(problem, near.shots.begin, near.shots.length)
+        shift = shots.place[:, 0] - near.shots.place[:, 0]
+        starts = replace(near.fit.starts, position=near.fit.starts.position + shift)
+        problem.choose(_touched(problem, shots, starts))
+        known = zip(problem.parameters, problem.start, strict=True)
+        values = np.array([near.values.get((p.kind, p.name), value) for p, value in known])
+        fitting = Fitting(shots, moved)
+        best = _Fit(values, np.zeros(shots.camera.shape[-1]), starts)
+        best = fitting.solved(best, ROUNDS, on_progress, "another camera")
+    values_of = {(p.kind, p.name): float(v) for p, v in zip(problem.parameters, best.values, strict=True)}
+    return Filmed(reported(problem, fitting, best), fitting.shots, best, values_of)
+
+
+def _from_nothing(problem: Problem, on_progress: Progress) -> tuple[Fitting, _Fit]:
+    """The fit of short windows, from several first guesses; then that of long ones."""
+    recordings, dt = problem.recordings, problem.recordings[0].dt
     if max(abs(r.dt - dt) for r in recordings) > 1e-3 * dt:
         raise SdfsimError("the films have different numbers of frames a second", "identify from each alone")
     scale = math.sqrt(float(np.max(problem.sizes)) / SIZE)
@@ -345,7 +381,7 @@ def identify_films(
         last = final.solved(_Fit(best.values.copy(), best.camera.copy(), guess), ROUNDS, on_progress, "long windows")
         if last.mean < WORSE * best.mean:
             fitting, best = final, last
-    return reported(problem, fitting, best), motion_of(fitting.shots, best), best.camera
+    return fitting, best
 
 
 def _touched(problem: Problem, shots: Shots, starts: _Starts) -> list:
@@ -396,7 +432,7 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
         covariance = covariance + (len(own) - 1) * np.cov(np.array(left).T, bias=True).reshape(count, count)
     exact = np.array([SLACK if p.kind in ("friction", "restitution") else 0.0 for p in problem.parameters]) / width
     covariance = covariance + np.diag(exact**2)
-    before = np.array([KNOWN.get(p.kind, math.inf) for p in problem.parameters]) / width
+    before = known_before(problem) / width
     shown = np.sqrt(np.diag(covariance)) < np.minimum(SHOWN, TOLD * before)
     for k, p in enumerate(problem.parameters):
         if p.kind == "friction" and shown[k]:
