@@ -92,7 +92,9 @@ def checked(clip: Clip, back: Background) -> None:
     for later in grey[1:]:
         moved, found, _ = cv2.calcOpticalFlowPyrLK(grey[0], later, corners, corners.copy(), winSize=(15, 15))
         way = (moved - corners)[found[:, 0] == 1][:, 0]
-        drift = np.abs(np.median(way, axis=0)).max() if len(way) >= 12 else 0.0
+        # What most corners agree on: some are on what moves, and some are lost.
+        alike = np.abs(way[:, None] - way).max(-1) < 0.5
+        drift = np.abs(way[alike[alike.sum(1).argmax()]].mean(0)).max() if len(way) >= 12 else 0.0
         if drift > DRIFT:
             raise SdfsimError(
                 f"{clip.path}: the camera moves, by {drift:.1f} px",

@@ -116,7 +116,7 @@ def watched(
         moved = [one and in_world(one, turn, shift) for one in tracks[0].seen]
         tracks = [deepened(clip, eye, again(clip, back, eye, shutter, Track(look, moved)))]
     notes = [*clip.notes, f"shutter open for {1e3 * shutter.open:.2g} ms, smeared by {shutter.spread:.2g} px"]
-    scene = with_paths(clip, scene, supports, [body.name for body in led])
+    scene = with_paths(clip, eye, scene, supports)
     return Film(clip, back, shutter, eye, tracks, supports, scene, recording_of(clip, eye, tracks, scene), notes)
 
 
@@ -175,7 +175,7 @@ def _seen_by(film: Film, eye: Eye) -> Film:
         covered = [masks(film.clip, eye, one) for one in tracks]
         every = [_either([of[k] for of in covered]) for k in range(len(film.clip.time))]
         supports, back = behind_others(film.clip, eye, supports, film.shutter, every)
-        scene = with_paths(film.clip, scene, supports, [one.look.name for one in supports])
+        scene = with_paths(film.clip, eye, scene, supports)
     tracks = [deepened(film.clip, eye, again(film.clip, back, eye, film.shutter, one)) for one in tracks]
     recording = recording_of(film.clip, eye, tracks, scene)
     return replace(film, back=back, eye=eye, tracks=tracks, supports=supports, scene=scene, recording=recording)

@@ -132,25 +132,29 @@ def _face(clip: Clip, eye: Eye, track: Track, k: int, n: int, at: Window) -> np.
     return np.median(views, 0)
 
 
-def with_paths(clip: Clip, scene: Scene, tracks: Sequence[Track], names: Sequence[str]) -> Scene:
-    """The scene whose bodies of these names move as tracked."""
-    path = {name: _path(clip, one) for name, one in zip(names, tracks, strict=True)}
-    bodies = [replace(b, path=path.get(b.name, b.path)) for b in scene.bodies]
-    for k, b in enumerate(bodies):
-        if b.name in path and b.path is not None:
-            bodies[k] = replace(b, position=b.path.position[0], quat_xyzw=b.path.quat_xyzw[0])
-    return replace(scene, bodies=tuple(bodies))
+def with_paths(clip: Clip, eye: Eye, scene: Scene, tracks: Sequence[Track]) -> Scene:
+    """The scene whose bodies of these tracks move as tracked."""
+    path = {one.look.name: _path(clip, eye, one) for one in tracks}
+    bodies = tuple(
+        replace(b, path=path[b.name], position=path[b.name].position[0], quat_xyzw=path[b.name].quat_xyzw[0])
+        if b.name in path else b for b in scene.bodies
+    )  # fmt: skip
+    return replace(scene, bodies=bodies)
 
 
-def _path(clip: Clip, track: Track) -> Waypoints:
-    """A smooth path through the poses of a track; how smooth, cross-validation of its frames decides."""
+def _path(clip: Clip, eye: Eye, track: Track) -> Waypoints:
+    """A smooth path through the poses of a track. How smooth, cross-validation decides for each of six numbers, in the
+    camera's axes: across the picture frames are exact, in depth and tilt towards the camera they are not."""
     rows = track.frames
     time = clip.time[rows] - clip.time[0]
-    place, turn = np.stack([track.at(k).place for k in rows]), np.stack([track.at(k).turn for k in rows])
+    local = np.stack([eye.seen(track.at(k).place) for k in rows])
+    turn = np.stack([track.at(k).turn for k in rows])
     middle = turn[len(turn) // 2]
-    away = pose.to_rotvec(pose.multiply(turn, pose.conjugate(middle)))
-    smooth = [make_smoothing_spline(time, column)(time) for column in np.c_[place, away].T]
-    both = np.stack(smooth, 1)
-    turned = pose.multiply(pose.from_rotvec(both[:, 3:]), middle)
-    origin = both[:, :3] - pose.rotate(turned, np.tile(track.look.com, (len(rows), 1)))
+    away = pose.to_rotvec(pose.multiply(turn, pose.conjugate(middle))) @ eye.rotation.T
+    columns = np.c_[local[:, :2] / local[:, 2:], np.log(local[:, 2]), away]
+    smooth = np.stack([make_smoothing_spline(time, column)(time) for column in columns.T], 1)
+    depth = np.exp(smooth[:, 2:3])
+    place = (np.c_[smooth[:, :2] * depth, depth] - eye.translation) @ eye.rotation
+    turned = pose.multiply(pose.from_rotvec(smooth[:, 3:] @ eye.rotation), middle)
+    origin = place - pose.rotate(turned, np.tile(track.look.com, (len(rows), 1)))
     return Waypoints(time, origin, turned)

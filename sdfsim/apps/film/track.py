@@ -22,6 +22,7 @@ from sdfsim.scene.scene import Scene
 
 STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things that move there, and orientations
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
+TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely one beyond it is
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
@@ -118,18 +119,25 @@ def find(
                     tried.append(rough)
                 if rough is not None and rough.score > 0.9:
                     break
-            tried.sort(key=lambda one: -one.score)
-            for rough in tried[:2]:
+            first, *others = tried or [None]
+            others.sort(key=lambda one: -one.score)
+            for rough in [first, *others[:2]] if first else []:
                 sharp = fitted(look, eye, frame, rough.place, rough.turn, none, 0.7, None)
                 if sharp is not None:
-                    found.append((sharp.score, k, sharp))
+                    found.append((k, sharp))
         on_progress(0.0, f"looking for {name} in frame {k}")
-    if not found or max(score for score, *_ in found) < POOR:
+    if not found or max(one.score for _, one in found) < POOR:
         raise SdfsimError(
             f"{clip.path}: nothing that moves looks like {name!r}",
             "check its shape and size in the scene, and the camera; more light may help",
         )
-    _, k, best = max(found, key=lambda one: one[0])
+
+    def unlikely(item: tuple[int, Seen]) -> float:
+        """A thin or small body looks alike from two sides: that of the scene is more likely."""
+        way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
+        return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
+
+    k, best = min(found, key=unlikely)
     if free and _twins(found, look):
         raise SdfsimError(
             f"{clip.path}: two things that move look like {name!r}",
@@ -138,12 +146,12 @@ def find(
     return k, best
 
 
-def _twins(found: list[tuple[float, int, Seen]], look: Look) -> bool:
+def _twins(found: list[tuple[int, Seen]], look: Look) -> bool:
     """Whether two things that look like a body move in several frames. What only seems to move stays in its place: a
     place that the body left, which the background still shows."""
     best: dict[int, list[Seen]] = {}
-    for score, k, one in sorted(found, key=lambda item: -item[0]):
-        if score > TWIN and all(
+    for k, one in sorted(found, key=lambda item: -item[1].score):
+        if one.score > TWIN and all(
             np.linalg.norm(one.place - other.place) > 2.0 * look.radius for other in best.get(k, [])
         ):
             best.setdefault(k, []).append(one)
