@@ -29,6 +29,7 @@ from sdfsim.scene.builder import SceneBuilder
 from sdfsim.simulate.camera import Camera
 
 SIZE = {"width": 320, "height": 240}
+FIRST = 10  # of the draws: on the ten before it the solve's own uncertainty was chosen
 EVERY = 5  # photos of a room of which one is tried
 
 
@@ -128,7 +129,7 @@ def main(out: Out, *, count: int = 20, room: Path | None = None) -> None:
     }  # fmt: skip
     for what, kind in kinds.items() if count else ():
         every = []
-        for seed in range(count):
+        for seed in range(FIRST, FIRST + count):
             folder = out / f"{kind.__name__}-{seed}"
             folder.mkdir(parents=True, exist_ok=True)
             if not (folder / "found.json").exists():

@@ -28,7 +28,8 @@ from sdfsim.scene.scene import Scene, Waypoints
 
 FITS = 0.6  # score that most frames of a body of the right shape have
 ENOUGH = 8  # frames in which a body must be seen
-AGAIN, SETTLED = 3, 0.2  # more rounds of the fit, and changes of the camera, in standard deviations, that end them
+AGAIN = 3  # more rounds of the fit
+SETTLED = 0.01  # rad, share of the distance, and of the focal length: changes of the camera that end them
 WORSE = 1.2  # rise of the cost of a round that ended elsewhere
 GONE = 0.25  # share of the frames after which a body may be out of the picture
 
@@ -135,13 +136,12 @@ def identify_clips(
     fit = identify_films([film.recording for film in films], films[0].scene, on_progress=on_progress)
     moved = np.zeros(len(fit.fit.camera))
     for _ in range(AGAIN):  # the camera as the motion shows it; its effect is only linear nearby
-        if np.abs(fit.fit.camera).max(initial=0.0) < SETTLED:
+        ends = np.cumsum([film.eye.doubt.shape[1] for film in films])[:-1]
+        changes = [f.eye.doubt @ by for f, by in zip(films, np.split(fit.fit.camera, ends), strict=True)]
+        if all(_small(film, change) for film, change in zip(films, changes, strict=True)):
             break
-        moved, begin, other = moved + fit.fit.camera, 0, []
-        for film in films:
-            change = fit.fit.camera[begin : begin + film.eye.doubt.shape[1]]
-            other.append(_seen_by(film, film.eye.moved(film.eye.doubt @ change)))
-            begin += len(change)
+        moved = moved + fit.fit.camera
+        other = [_seen_by(film, film.eye.moved(change)) for film, change in zip(films, changes, strict=True)]
         records = [film.recording for film in other]
         closer = identify_films(records, other[0].scene, near=fit, moved=moved, on_progress=on_progress)
         if closer.fit.cost > WORSE * fit.fit.cost:
@@ -158,6 +158,13 @@ def identify_clips(
         write_beside(first, made, beside)
     notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
     return replace(fit.found, notes=[*fit.found.notes, *notes])
+
+
+def _small(film: Film, change: np.ndarray) -> bool:
+    """Whether a change [WAYS] of a film's camera is so small that its effect is linear."""
+    track = film.tracks[0]
+    away = float(film.eye.seen(track.at(int(track.frames[0])).place)[2])
+    return bool((np.abs(change) < SETTLED * np.r_[np.ones(3), np.full(3, away), 1.0]).all())
 
 
 def _seen_by(film: Film, eye: Eye) -> Film:

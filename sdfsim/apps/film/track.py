@@ -29,6 +29,7 @@ ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame 
 FAR = 6  # frames for which a lost body is looked for where it would fly
 TWIN = 0.85  # score of each of two things that may both be the body
 OTHER = 60.0  # levels by which a ball's colour never differs from that in other frames
+HUE, FAINT = 0.08, 10.0  # how much hues of one thing differ; levels that are noise
 SHUTTERS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of the time between frames
 SPREADS = (0.0, 0.6, 1.0, 1.6)  # px
 
@@ -148,8 +149,10 @@ def find(
 
 def _twins(found: list[tuple[int, Seen]], look: Look) -> bool:
     """Whether two things that look like a body move in several frames. What only seems to move stays in its place: a
-    place that the body left, which the background still shows."""
+    place that the body left, which the background still shows. A shadow has another colour."""
     best: dict[int, list[Seen]] = {}
+    usual = _hue(max((one for _, one in found), key=lambda one: one.score))
+    found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE]
     for k, one in sorted(found, key=lambda item: -item[1].score):
         if one.score > TWIN and all(
             np.linalg.norm(one.place - other.place) > 2.0 * look.radius for other in best.get(k, [])
@@ -158,6 +161,13 @@ def _twins(found: list[tuple[int, Seen]], look: Look) -> bool:
     pairs = [some[:2] for some in best.values() if len(some) > 1]
     ways = [np.ptp([pair[n].place for pair in pairs], axis=0).max() for n in range(2)] if len(pairs) > 2 else [0.0]
     return min(ways) > 2.0 * look.radius
+
+
+def _hue(one: Seen) -> np.ndarray:
+    """[3] shares of red, green and blue in the faces that are seen; those of dark faces are noise, and about even."""
+    seen = one.color[(one.color > 1.0).any(1)]
+    mean = (seen.mean(0) if len(seen) else np.zeros(3)) + FAINT
+    return mean / mean.sum()
 
 
 def follow(

@@ -36,7 +36,8 @@ STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
 # What is known without the film, standard deviations, in the units of `Parameter`.
 KNOWN = {"inertia": 0.05, "size": 0.01, "tilt": math.radians(1.0), "mass": 1.0}
 LEVEL = 0.005  # m, of heights
-SLACK = 0.004  # of coefficients, which no film is expected to show better
+# Of coefficients, which no film is expected to show better: what rendered films were off by, beyond their poses.
+SLACK = {"friction": 0.01, "restitution": 0.0065}
 LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
 WORST = 4  # frames that are named
 TOLD = 0.7  # share of what was known before: a film that leaves more does not show it
@@ -430,7 +431,7 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
             part, some = slope[w * size : (w + 1) * size], right[w * size : (w + 1) * size]
             left.append(np.linalg.solve(normal - part.T @ part + 1e-3 * np.diag(np.diag(normal)), part.T @ some))
         covariance = covariance + (len(own) - 1) * np.cov(np.array(left).T, bias=True).reshape(count, count)
-    exact = np.array([SLACK if p.kind in ("friction", "restitution") else 0.0 for p in problem.parameters]) / width
+    exact = np.array([SLACK.get(p.kind, 0.0) for p in problem.parameters]) / width
     covariance = covariance + np.diag(exact**2)
     before = known_before(problem) / width
     shown = np.sqrt(np.diag(covariance)) < np.minimum(SHOWN, TOLD * before)
