@@ -23,6 +23,7 @@ from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.parallel import Progress, silent
+from sdfsim.physics import pose
 from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.scene import Scene, Waypoints
 
@@ -83,7 +84,7 @@ def watched(
     if supports:
         supports, back = behind_others(clip, eye, supports, shutter)
     for body, look in zip(moving, looks, strict=True):
-        place = body.position + look.com
+        place = body.position + pose.rotate(body.quat_xyzw, look.com)
         k, first = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(moving) == 1)
         tracks.append(follow(clip, back, look, eye, shutter, k, first, gravity, on_progress=on_progress))
         _judged(clip, tracks[-1], body.name)

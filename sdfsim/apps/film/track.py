@@ -22,7 +22,7 @@ from sdfsim.scene.scene import Scene
 
 STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things that move there, and orientations
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
-TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely one beyond it is
+TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely what it does not have is
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
@@ -109,6 +109,11 @@ def find(
     if not look.ball:
         turns += [pose.normalise(q) for q in rng.standard_normal((TURNS, 4))]
     none, found = np.zeros(2), []
+    frame = frame_of(clip, back, 0, way=-1)
+    begun = fitted(look, eye, frame, place, turn, none, 0.7, None, wide=2.5)
+    begun = begun and fitted(look, eye, frame, begun.place, begun.turn, none, 0.7, None)
+    if begun is not None:
+        found.append((0, begun))
     for k in np.unique(np.linspace(0, len(clip.time) - 1, STARTS + 2)[1:-1].astype(int)).tolist():
         frame = frame_of(clip, back, k)
         # A place where the body rests for long, before or after, differs from the median when it is free.
@@ -134,7 +139,9 @@ def find(
         )
 
     def unlikely(item: tuple[int, Seen]) -> float:
-        """A thin or small body looks alike from two sides: that of the scene is more likely."""
+        """A thin or small body looks alike from two sides, and others move too: what the scene has is more likely."""
+        if item[1] is begun:
+            return (1.0 - begun.score) / OTHERWISE
         way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
         return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
 
