@@ -29,6 +29,7 @@ from sdfsim.simulate.batch import Copies, inner_of_frame
 SHORT, LONG = 0.4, 1.3  # s of windows for bodies of ten centimetres: the first fit, and the last
 FINE = 4  # times as many inner steps as usual: poses of films show an impact to less than one
 ROUNDS = 10
+LAGS = 12  # frames over which errors may be alike
 ODD = 3.0  # standard deviations beyond which a pose counts less
 WORSE = 3.0  # how much larger the remaining differences of long windows may be than those of short ones
 SIZE = 0.1  # m, of the bodies for which windows are as long as said
@@ -315,7 +316,7 @@ class Filmed:
     found: Identified
     shots: Shots
     fit: _Fit  # its `camera` [C]: how the cameras of all films were changed, in standard deviations
-    values: dict[tuple[str, str], float]  # of parameters, by kind and name
+    values: list[dict[tuple[str, str], float]]  # of parameters, by kind and name, with each of the cameras so far
 
 
 def identify_films(
@@ -336,12 +337,13 @@ def identify_films(
         starts = replace(near.fit.starts, position=near.fit.starts.position + shift)
         problem.choose(_touched(problem, shots, starts))
         known = zip(problem.parameters, problem.start, strict=True)
-        values = np.array([near.values.get((p.kind, p.name), value) for p, value in known])
+        values = np.array([near.values[-1].get((p.kind, p.name), value) for p, value in known])
         fitting = Fitting(shots, moved)
         best = _Fit(values, np.zeros(shots.camera.shape[-1]), starts)
         best = fitting.solved(best, ROUNDS, on_progress, "another camera")
-    values_of = {(p.kind, p.name): float(v) for p, v in zip(problem.parameters, best.values, strict=True)}
-    return Filmed(reported(problem, fitting, best), fitting.shots, best, values_of)
+    now = {(p.kind, p.name): float(v) for p, v in zip(problem.parameters, best.values, strict=True)}
+    every = [*(near.values if near else []), now]
+    return Filmed(reported(problem, fitting, best, every), fitting.shots, best, every)
 
 
 def _from_nothing(problem: Problem, on_progress: Progress) -> tuple[Fitting, _Fit]:
@@ -402,8 +404,22 @@ def _touched(problem: Problem, shots: Shots, starts: _Starts) -> list:
     return touched
 
 
-def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
-    """Values with intervals: starts and camera are fitted again for each value of a parameter."""
+def _persistence(shots: Shots, off: np.ndarray) -> float:
+    """How many frames tell as much as one whose error is its own: errors of neighbouring frames are alike (Newey and
+    West 1987). For differences [W, L + 1, D, 6]."""
+    seen, alike = np.abs(shots.root).sum((-1, -2)) > 0, np.zeros(LAGS + 1)
+    for w, d in np.ndindex(off.shape[0], off.shape[2]):
+        rest = np.clip(off[w, seen[w, :, d], d], -ODD, ODD)
+        alike += [float((rest[: len(rest) - lag] * rest[lag:]).sum()) for lag in range(LAGS + 1)]
+    share = 1.0 - np.arange(1, LAGS + 1) / (LAGS + 1)
+    return 1.0 + 2.0 * max(0.0, float(share @ alike[1:]) / max(alike[0], 1e-9))
+
+
+def reported(
+    problem: Problem, fitting: Fitting, fit: _Fit, every: Sequence[dict[tuple[str, str], float]]
+) -> Identified:
+    """Values with intervals: starts and camera are fitted again for each value of a parameter. `every`: what was found
+    with other cameras."""
     off, weight, _, _ = fitting.errors(fit)
     own, shared = fitting.slopes(fit, off)
     rest, own, shared = fitting.blocks(fit, off, weight, own, shared)
@@ -422,7 +438,7 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
     seen = np.abs(off).sum(-1) > 0
     spread = max(1.0, float(np.median(np.square(off).mean(-1)[seen])) / TYPICAL)
     normal = slope.T @ slope + 1e-9 * np.eye(count)
-    covariance = spread * np.linalg.inv(normal)
+    covariance = spread * _persistence(fitting.shots, off) * np.linalg.inv(normal)
     # What the laws of contact do not say (restitution that changes with speed) shows in how windows differ.
     size = len(own[0])
     if len(own) > 2:
@@ -432,7 +448,9 @@ def reported(problem: Problem, fitting: Fitting, fit: _Fit) -> Identified:
             left.append(np.linalg.solve(normal - part.T @ part + 1e-3 * np.diag(np.diag(normal)), part.T @ some))
         covariance = covariance + (len(own) - 1) * np.cov(np.array(left).T, bias=True).reshape(count, count)
     exact = np.array([SLACK.get(p.kind, 0.0) for p in problem.parameters]) / width
-    covariance = covariance + np.diag(exact**2)
+    names = [(p.kind, p.name) for p in problem.parameters]
+    rounds = np.array([[found.get(name, v) for name, v in zip(names, fit.values, strict=True)] for found in every])
+    covariance = covariance + np.diag(exact**2 + np.square(rounds.std(0) / width))
     before = known_before(problem) / width
     shown = np.sqrt(np.diag(covariance)) < np.minimum(SHOWN, TOLD * before)
     for k, p in enumerate(problem.parameters):
