@@ -41,7 +41,7 @@ def lie(time: float) -> tuple[np.ndarray, Rotation]:
 
 
 def plank_path() -> list[dict]:
-    poses = [(t, *lie(t)) for t in np.arange(0, 1.81, 0.02)]
+    poses = [(t, *lie(t)) for t in np.arange(0, 1.81, 0.02).tolist()]
     return [{"time": t, "position": p.tolist(), "quat_xyzw": q.as_quat().tolist()} for t, p, q in poses]
 
 
@@ -71,6 +71,7 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     again = sdfsim.load_scene(tmp_path / "identified.yaml")
     plank = next(b for b in again.bodies if b.name == "plank")
     assert plank.motion == "kinematic"
+    assert plank.path is not None
     last = Rotation.from_quat(plank.path.quat_xyzw[-1])
     assert np.degrees(last.magnitude()) == pytest.approx(30, abs=1.0)
 

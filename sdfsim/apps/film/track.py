@@ -141,7 +141,7 @@ def find(
     def unlikely(item: tuple[int, Seen]) -> float:
         """A thin or small body looks alike from two sides, and others move too: what the scene has is more likely."""
         if item[1] is begun:
-            return (1.0 - begun.score) / OTHERWISE
+            return (1.0 - item[1].score) / OTHERWISE
         way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
         return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
 
