@@ -61,7 +61,7 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     track = film.supports[0]
     assert len(track.frames) == len(film.clip.time)
     for k in track.frames:
-        off = Rotation.from_quat(track.at(k).turn) * lie(film.clip.time[k])[1].inv()
+        off = Rotation.from_quat(track.at(k).turn) * lie(float(film.clip.time[k]))[1].inv()
         assert abs(np.degrees(off.as_rotvec()[1])) < 0.6, k  # in the plane of the picture, nearly
 
     found = identify_clips([clip], scene, points=tmp_path / "points.yaml", bodies=["plank"])
