@@ -410,7 +410,7 @@ def _persistence(shots: Shots, off: np.ndarray) -> float:
     seen, alike = np.abs(shots.root).sum((-1, -2)) > 0, np.zeros(LAGS + 1)
     for w, d in np.ndindex(off.shape[0], off.shape[2]):
         rest = np.clip(off[w, seen[w, :, d], d], -ODD, ODD)
-        alike += [float((rest[: len(rest) - lag] * rest[lag:]).sum()) for lag in range(LAGS + 1)]
+        alike += [float((rest[: max(0, len(rest) - lag)] * rest[lag:]).sum()) for lag in range(LAGS + 1)]
     share = 1.0 - np.arange(1, LAGS + 1) / (LAGS + 1)
     return 1.0 + 2.0 * max(0.0, float(share @ alike[1:]) / max(alike[0], 1e-9))
 
