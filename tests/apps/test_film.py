@@ -16,7 +16,7 @@ from sdfsim import Camera
 from sdfsim.apps.film.camera import of_points
 from sdfsim.apps.film.film import identify_clips
 from sdfsim.apps.film.frames import read_clip, true_times
-from sdfsim.apps.identify.filmed import _persistence
+from sdfsim.apps.identify.filmed import persistence as persistence_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Scene
 from tests.helpers.clips import GRAVITY, bouncing, filmed
@@ -227,7 +227,7 @@ def test_errors_of_neighbouring_frames_that_are_alike_count_less():
     rng = np.random.default_rng(0)
 
     def persistence(off: np.ndarray) -> float:
-        return _persistence(cast("Any", SimpleNamespace(root=np.ones((*off.shape, 6)))), off)
+        return persistence_of(cast("Any", SimpleNamespace(root=np.ones((*off.shape, 6)))), off)
 
     white = rng.standard_normal((2, 1000, 1, 6))
     alike = white.copy()

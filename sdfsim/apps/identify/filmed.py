@@ -404,7 +404,7 @@ def _touched(problem: Problem, shots: Shots, starts: _Starts) -> list:
     return touched
 
 
-def _persistence(shots: Shots, off: np.ndarray) -> float:
+def persistence(shots: Shots, off: np.ndarray) -> float:
     """How many frames tell as much as one whose error is its own: errors of neighbouring frames are alike (Newey and
     West 1987). For differences [W, L + 1, D, 6]."""
     seen, alike = np.abs(shots.root).sum((-1, -2)) > 0, np.zeros(LAGS + 1)
@@ -438,7 +438,7 @@ def reported(
     seen = np.abs(off).sum(-1) > 0
     spread = max(1.0, float(np.median(np.square(off).mean(-1)[seen])) / TYPICAL)
     normal = slope.T @ slope + 1e-9 * np.eye(count)
-    covariance = spread * _persistence(fitting.shots, off) * np.linalg.inv(normal)
+    covariance = spread * persistence(fitting.shots, off) * np.linalg.inv(normal)
     # What the laws of contact do not say (restitution that changes with speed) shows in how windows differ.
     size = len(own[0])
     if len(own) > 2:
