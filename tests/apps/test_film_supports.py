@@ -80,6 +80,10 @@ def test_static_bodies_that_are_named_are_moved_along():
     scene = plank_scene().load()
     assert [b.motion for b in with_moving(scene, ["plank"]).bodies] == ["static", "kinematic", "dynamic"]
     assert [b.motion for b in with_moving(scene, ["cube"]).bodies] == ["static", "static", "dynamic"]
+    both = plank_scene().add("vase", box={"size": [0.1, 0.1, 0.1]}, position=[0, 0.5, 0.05], velocity=[1, 0, 0]).load()
+    rests = with_moving(both, ["cube"])
+    assert [b.motion for b in rests.bodies] == ["static", "static", "dynamic", "static"]
+    assert Simulator(rests).run(0.1).position[-1, 3].tolist() == [0.0, 0.5, 0.05]
     with pytest.raises(SdfsimError, match=r"no body of the scene.*did you mean 'plank'"):
         with_moving(scene, ["plnk"])
     with pytest.raises(SdfsimError, match="no body of the scene"):

@@ -46,7 +46,7 @@ class Look:
         vertices = body.scale * (shape.mesh.vertices - shape.com)
         self.corners = vertices[:: max(1, len(vertices) // 500)]
         self.radius = self.ball or float(np.linalg.norm(vertices, axis=1).max())
-        self.parts, self.round = 1, True
+        self.parts, self.round, self.faces = 1, True, []
         if not self.ball:
             self.caster = Caster(Mesh(vertices, shape.mesh.faces))
             self.part = _parts(Mesh(vertices, shape.mesh.faces))

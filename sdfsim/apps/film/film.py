@@ -58,7 +58,7 @@ def watched(
     end: float | None = None, bodies: Sequence[str] = (), on_progress: Progress = silent,
 ) -> Film:  # fmt: skip
     """As `track`, with everything else that was found."""
-    names, scene = bodies, with_moving(scene, bodies)
+    names, given, scene = bodies, scene, with_moving(scene, bodies)
     clip = read_clip(path, slow=slow, start=start, end=end, on_progress=on_progress)
     back = background(clip)
     checked(clip, back)
@@ -109,8 +109,8 @@ def watched(
     if eye.source == BY_FALLING:
         look = looks[0]
         below = [
-            b.position[2] + b.scale * scene.shapes[b.shape].sdf.bounds[1, 2]
-            for b in scene.bodies
+            b.position[2] + b.scale * given.shapes[b.shape].sdf.bounds[1, 2]
+            for b in given.bodies
             if b.motion == "static"
         ]
         ground = max([z if np.isfinite(z) else 0.0 for z in below], default=0.0) + look.ball
@@ -190,8 +190,8 @@ def _seen_by(film: Film, eye: Eye) -> Film:
 
 
 def with_moving(scene: Scene, names: Sequence[str]) -> Scene:
-    """The scene with only these of the moving bodies (all if none of them is named), and with static ones of these
-    names as bodies on paths. Raises SdfsimError for a name that it does not have."""
+    """The scene in which only these of the moving bodies move (all if none of them is named), and static ones of these
+    names are bodies on paths. Raises SdfsimError for a name that it does not have."""
     known = {body.name: body.motion for body in scene.bodies if np.isfinite(scene.shapes[body.shape].sdf.bounds).all()}
     for name in names:
         if name not in known:
@@ -204,7 +204,9 @@ def with_moving(scene: Scene, names: Sequence[str]) -> Scene:
         if body.name in names and body.motion == "static":
             path = Waypoints(np.zeros(1), body.position[None], body.quat_xyzw[None])
             bodies.append(replace(body, motion="kinematic", path=path))
-        elif not chosen or body.motion != "dynamic" or body.name in names:
+        elif chosen and body.motion == "dynamic" and body.name not in names:
+            bodies.append(replace(body, motion="static", velocity=np.zeros(3), angular_velocity=np.zeros(3)))
+        else:
             bodies.append(body)
     return replace(scene, bodies=tuple(bodies)) if names else scene
 
