@@ -1,5 +1,6 @@
 """Films in which a support is moved: a plank that is tilted until a cube slides."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,6 +75,19 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     assert plank.path is not None
     last = Rotation.from_quat(plank.path.quat_xyzw[-1])
     assert np.degrees(last.magnitude()) == pytest.approx(30, abs=1.0)
+
+
+def test_a_support_that_is_not_where_the_scene_has_it_is_said(tmp_path: Path):
+    scene = plank_scene().load()
+    camera = Camera((0.3, -1.5, 0.7), look_at=(-0.05, 0, 0.2), fov=40, width=160, height=120)
+    rest = np.array([body.position for body in scene.bodies]), np.array([body.quat_xyzw for body in scene.bodies])
+    clip = filmed(tmp_path / "clip.mp4", scene, lambda _: rest, camera, 0.4, 30, subframes=1)
+    pixels, _ = camera.project(PLACES)
+    points = [{"pixel": p.tolist(), "place": q.tolist()} for p, q in zip(pixels, PLACES, strict=True)]
+    (tmp_path / "points.yaml").write_text(yaml.safe_dump({"points": points}))
+    wrong = [replace(b, position=b.position + (b.name == "plank") * np.array([0.1, 0, 0.25])) for b in scene.bodies]
+    with pytest.raises(SdfsimError, match="'plank' is not where the scene has it"):
+        watched(clip, replace(scene, bodies=tuple(wrong)), points=tmp_path / "points.yaml", bodies=["plank"])
 
 
 def test_static_bodies_that_are_named_are_moved_along():

@@ -17,7 +17,7 @@ from sdfsim.apps.film.frames import Clip, read_clip
 from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.supports import behind_others, supported, with_paths
-from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, find, follow, masks, shutter_of
+from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, either, find, follow, masks, shutter_of
 from sdfsim.apps.identify.filmed import identify_films, motion_of
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
@@ -90,14 +90,14 @@ def watched(
         _judged(clip, tracks[-1], body.name)
     shutter = shutter_of(clip, back, eye, tracks[0])
     covered = [masks(clip, eye, one) for one in tracks]
-    every = [_either([of[k] for of in covered]) for k in range(len(clip.time))]
+    every = [either([of[k] for of in covered]) for k in range(len(clip.time))]
     if supports:
         supports, back = behind_others(clip, eye, supports, shutter, every)
     else:
         back = background(clip, every)
     refined = []
     for d, one in enumerate(tracks):
-        others = [_either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
+        others = [either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
         k = max(one.frames.tolist(), key=lambda k: one.at(k).score)
         full = follow(clip, back, one.look, eye, shutter, k, one.at(k), gravity, others, on_progress)
         refined.append(deepened(clip, eye, again(clip, back, eye, shutter, full, others)))
@@ -181,7 +181,7 @@ def _seen_by(film: Film, eye: Eye) -> Film:
     tracks, supports, back, scene = placed[: len(film.tracks)], placed[len(film.tracks) :], film.back, film.scene
     if supports:
         covered = [masks(film.clip, eye, one) for one in tracks]
-        every = [_either([of[k] for of in covered]) for k in range(len(film.clip.time))]
+        every = [either([of[k] for of in covered]) for k in range(len(film.clip.time))]
         supports, back = behind_others(film.clip, eye, supports, film.shutter, every)
         scene = with_paths(film.clip, eye, scene, supports)
     tracks = [deepened(film.clip, eye, again(film.clip, back, eye, film.shutter, one)) for one in tracks]
@@ -209,11 +209,6 @@ def with_moving(scene: Scene, names: Sequence[str]) -> Scene:
         else:
             bodies.append(body)
     return replace(scene, bodies=tuple(bodies)) if names else scene
-
-
-def _either(found: list[np.ndarray | None]) -> np.ndarray | None:
-    there = [one for one in found if one is not None]
-    return np.logical_or.reduce(there) if there else None
 
 
 def _judged(clip: Clip, track: Track, name: str) -> None:

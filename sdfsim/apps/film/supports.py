@@ -16,7 +16,7 @@ from sdfsim.apps.film.drawing import Look, Window
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.frames import Clip
 from sdfsim.apps.film.poses import Frame, Seen, Shutter, fitted, smear
-from sdfsim.apps.film.track import POOR, Track, again, follow, masks
+from sdfsim.apps.film.track import POOR, Track, again, either, follow, masks
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress
 from sdfsim.physics import pose
@@ -41,7 +41,7 @@ def supported(
     for look, body in zip(looks, bodies, strict=True):
         place, turn = body.position + pose.rotate(body.quat_xyzw, look.com), body.quat_xyzw
         one: Seen | None = None
-        behind = back
+        behind, begun = back, place
         for wide, margin in BEGIN:
             at = look.window(eye, place, turn, 8.0)
             cover = np.zeros(clip.pixels.shape[1:3], np.float32)
@@ -56,7 +56,7 @@ def supported(
             if one is None:
                 break
             place, turn = one.place, one.turn
-        if one is None or one.score < POOR:
+        if one is None or one.score < POOR or np.linalg.norm(place - begun) > look.radius:
             raise SdfsimError(
                 f"{clip.path}: {body.name!r} is not where the scene has it when the film begins",
                 "correct its position in the scene, or the points; --start chooses another beginning",
@@ -72,16 +72,11 @@ def behind_others(
     """Supports and what is behind them, both found again; then they are drawn into the background. `covered`: [T]
     masks of what is before them, if that is known."""
     around = [masks(clip, eye, one) for one in tracks]
-    every = [_any([of[k] for of in (*around, *([covered] if covered else []))]) for k in range(len(clip.time))]
+    every = [either([of[k] for of in (*around, *([covered] if covered else []))]) for k in range(len(clip.time))]
     back = background(clip, every, complete=covered is not None)
     tracks = [again(clip, back, eye, shutter, one, covered) for one in tracks]
     front: Front = partial(_drawn, clip, eye, shutter, tracks)
     return tracks, replace(back, front=front)
-
-
-def _any(found: Sequence[np.ndarray | None]) -> np.ndarray | None:
-    there = [one for one in found if one is not None]
-    return np.logical_or.reduce(there) if there else None
 
 
 def _drawn(clip: Clip, eye: Eye, shutter: Shutter, tracks: Sequence[Track], still: np.ndarray, k: int) -> np.ndarray:

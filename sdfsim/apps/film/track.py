@@ -335,3 +335,9 @@ def masks(clip: Clip, eye: Eye, track: Track, wide: float = 3.0) -> list[np.ndar
         mask[at.rows, at.columns] = cv2.GaussianBlur(cover, (0, 0), wide) > 0.02
         found.append(mask)
     return found
+
+
+def either(found: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Masks of several bodies as one; None if there is none."""
+    there = [one for one in found if one is not None]
+    return np.logical_or.reduce(there) if there else None
