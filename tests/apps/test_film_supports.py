@@ -58,13 +58,6 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     plank_scene().save(tmp_path / "scene.yaml")
     scene = sdfsim.load_scene(tmp_path / "scene.yaml")
 
-    film = watched(clip, scene, points=tmp_path / "points.yaml", bodies=["plank"])
-    track = film.supports[0]
-    assert len(track.frames) == len(film.clip.time)
-    for k in track.frames:
-        off = Rotation.from_quat(track.at(k).turn) * lie(float(film.clip.time[k]))[1].inv()
-        assert abs(np.degrees(off.as_rotvec()[1])) < 0.6, k  # in the plane of the picture, nearly
-
     found = identify_clips([clip], scene, points=tmp_path / "points.yaml", bodies=["plank"])
     slid = next(e for e in found.estimates if (e.kind, e.name) == ("friction", "cube / plank"))
     assert slid.value == pytest.approx(FRICTION, abs=0.03)
@@ -73,8 +66,9 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     plank = next(b for b in again.bodies if b.name == "plank")
     assert plank.motion == "kinematic"
     assert plank.path is not None
-    last = Rotation.from_quat(plank.path.quat_xyzw[-1])
-    assert np.degrees(last.magnitude()) == pytest.approx(30, abs=1.0)
+    for time, quat in zip(plank.path.time, plank.path.quat_xyzw, strict=True):
+        off = Rotation.from_quat(quat) * lie(float(time))[1].inv()
+        assert abs(np.degrees(off.as_rotvec()[1])) < 1.0, time  # in the plane of the picture, nearly
 
 
 def test_a_support_that_is_not_where_the_scene_has_it_is_said(tmp_path: Path):
