@@ -109,7 +109,7 @@ def cameras(room: Path) -> list[list[Any]]:
         view = way.view(views[k])
         pixels = cv2.imread(str(room / "photos/images" / view.name))[:, :, ::-1]
         size = (view.width, view.height)
-        eye = of_points(*of_room(pixels, room, view.name, without=k), None, size, view.name)
+        eye = of_points(of_room(pixels, room, view.name, without=k), size, view.name)
         focal.append(abs(eye.focal / view.focal - 1.0))
         local = eye.rotation @ (view.center + eye.rotation.T @ eye.translation)
         place.append(float(np.linalg.norm(local)))

@@ -69,17 +69,18 @@ class Tracks:
     orientation: np.ndarray  # [K, P, 4] float64 xyzw
     com: np.ndarray  # [K, 3] float64, centre of mass from the shape's origin (shape axes)
 
-    def at(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Centres of mass [K, 3] and orientations [K, 4] at `time`."""
-        row = np.arange(len(self.body))
-        before = np.clip((self.time <= time).sum(1) - 1, 0, self.time.shape[1] - 2)
+    def at(self, time: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Centres of mass [..., K, 3] and orientations [..., K, 4] at times [...]."""
+        time, row = np.asarray(time), np.arange(len(self.body))
+        before = np.stack([np.searchsorted(known, time, side="right") for known in self.time], -1) - 1
+        before = np.clip(before, 0, self.time.shape[1] - 2)
         start, stop = self.time[row, before], self.time[row, before + 1]
-        share = np.clip((time - start) / (stop - start), 0.0, 1.0)[:, None]
+        share = np.clip((time[..., None] - start) / (stop - start), 0.0, 1.0)[..., None]
         origin = self.origin[row, before] + share * (self.origin[row, before + 1] - self.origin[row, before])
         first, last = self.orientation[row, before], self.orientation[row, before + 1]
         turn = pose.to_rotvec(pose.multiply(last, pose.conjugate(first)))
         orientation = pose.normalise(pose.multiply(pose.from_rotvec(share * turn), first))
-        return origin + pose.rotate(orientation, self.com), orientation
+        return origin + pose.rotate(orientation, np.broadcast_to(self.com, origin.shape)), orientation
 
     def velocity(self, time: float, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean velocity [K, 3] and angular velocity [K, 3] from `time` to `time + dt`: those that lead from pose to

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 import cli
 import sdfsim
 from sdfsim import Camera
-from sdfsim.apps.film.camera import of_points
+from sdfsim.apps.film.camera import Points, of_points, read_points
+from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.film import identify_clips
 from sdfsim.apps.film.frames import read_clip, true_times
 from sdfsim.apps.identify.filmed import persistence as persistence_of
@@ -107,11 +108,36 @@ def test_a_box_that_slides_shows_its_friction(tmp_path):
 
 def test_points_of_known_places_show_the_camera():
     pixels, _ = CAMERA.project(PLACES)
-    eye = of_points(pixels, PLACES, None, (320, 240), "points")
+    eye = of_points(Points(pixels, PLACES), (320, 240), "points")
     assert eye.focal == pytest.approx(CAMERA.lens[0, 0], rel=0.02)
     assert np.allclose(-eye.rotation.T @ eye.translation, CAMERA.position, atol=0.03)
     with pytest.raises(SdfsimError, match="no camera sees these points"):
-        of_points(pixels[::-1], PLACES, None, (320, 240), "points")
+        of_points(Points(pixels[::-1], PLACES), (320, 240), "points")
+
+
+@pytest.mark.parametrize("roll", [0.0, 20.0])
+def test_a_known_length_and_the_horizon_show_the_camera(tmp_path: Path, roll: float):
+    """Two places on the table, and two pixels at the height of the camera; clicks are off by half a pixel."""
+    rng = np.random.default_rng(0)
+    turn = Rotation.from_euler("z", roll, degrees=True).as_matrix() @ CAMERA.rotation
+    place = np.array(CAMERA.position)
+    eye = Eye(turn, -turn @ place, CAMERA.lens[0, 0], 320, 240, np.zeros((7, 0)))
+    places = np.array([[0.1, -0.2, 0.0], [0.5, 0.1, 0.0]])
+    far = place + 1e5 * np.array([[-0.3, 1.0, 0.0], [0.4, 1.0, 0.0]])
+    spots = [*zip(places.tolist(), eye.project(places), strict=True), *(("horizon", at) for at in eye.project(far))]
+    points = [{"pixel": (at + rng.normal(0, 0.5, 2)).tolist(), "place": place} for place, at in spots]
+    (tmp_path / "points.yaml").write_text(yaml.safe_dump({"focal": float(eye.focal), "points": points}))
+    found = of_points(read_points(tmp_path / "points.yaml"), (320, 240), "points")
+    away = -found.rotation.T @ found.translation - place
+    assert np.linalg.norm(away) < 0.05 * np.linalg.norm(place)
+    turned = Rotation.from_matrix(eye.rotation @ found.rotation.T)
+    assert turned.magnitude() < np.radians(1.5)
+    shift = eye.translation - turned.apply(found.translation)
+    change = np.r_[turned.as_rotvec(), shift, np.log(eye.focal / found.focal)]
+    assert np.linalg.norm(np.linalg.solve(found.doubt, change)) < 4.3  # seven numbers, to 1 in 100
+    (tmp_path / "points.yaml").write_text(yaml.safe_dump({"points": points[1:]}))
+    with pytest.raises(SdfsimError, match="place: horizon"):
+        read_points(tmp_path / "points.yaml")
 
 
 def test_frames_that_repeat_others_are_left_out():

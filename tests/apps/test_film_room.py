@@ -101,9 +101,9 @@ def room(tmp_path_factory) -> Path:
 def test_a_camera_is_found_by_what_it_sees_of_the_room(room: Path, where: float, fov: float) -> None:
     """Its place, where it looks, and its focal length, which no photo has."""
     camera = at(where, fov)
-    pixels, places = of_room(seen(camera), room, "clip.mp4")
-    assert np.linalg.norm(camera.project(places)[0] - pixels, axis=1).max() < 5.0
-    eye = of_points(pixels, places, None, SIZE, "clip.mp4")
+    points = of_room(seen(camera), room, "clip.mp4")
+    assert np.linalg.norm(camera.project(points.places)[0] - points.pixels, axis=1).max() < 5.0
+    eye = of_points(points, SIZE, "clip.mp4")
     assert np.rad2deg(Rotation.from_matrix(eye.rotation @ camera.rotation.T).magnitude()) < 0.5
     assert eye.focal == pytest.approx(camera.lens[0, 0], rel=0.03)
     center = -eye.rotation.T @ eye.translation

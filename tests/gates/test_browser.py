@@ -106,9 +106,9 @@ def test_clicks_give_the_options_to_paste(photos, tmp_path):
             browser.click(*at)
         file = tmp_path / "points.yaml"
         file.write_text(browser.value("document.getElementById('option').textContent"))
-        pixels, known, focal = read_points(file)
-        assert known.tolist() == places and focal is None
-        assert np.abs(pixels - np.add(DOTS["wide & big.jpg"], 0.5)).max() < 0.003 * 4000 + 1
+        found = read_points(file)
+        assert found.places.tolist() == places and found.focal is None and not len(found.horizon)
+        assert np.abs(found.pixels - np.add(DOTS["wide & big.jpg"], 0.5)).max() < 0.003 * 4000 + 1
         assert not browser.errors
 
 

@@ -1,9 +1,9 @@
-"""Where the camera of a film stood: from points of known places, or from a ball that falls."""
+"""Where the camera of a film stood: from points of known places and the horizon, or from a ball that falls."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,56 +15,74 @@ from sdfsim.apps.film.poses import Seen
 from sdfsim.base.errors import SdfsimError
 from sdfsim.physics import pose
 
-CLICK = 1.0  # px, standard deviation of a clicked point
+CLICK, FAR = 1.0, 2.0  # px, standard deviations of a clicked point, and of one on the horizon
 LENS = 1.0, 0.35  # focal length of phones relative to the longer side, and the spread of its logarithm
 FLIGHT = 0.22  # s, of pieces in which a ball is taken to fly
 FITS = 4.0  # mean of squares up to which a piece is a flight
 LEVEL = 0.4  # rad, how much phones are tilted up or down
-LEAST = 4  # points
+LEAST, LEAST_LEVEL = 4, 2  # points; and with as many of the horizon
+YAWS = 72  # ways to turn about the vertical that are tried
 BY_FALLING = "a falling ball"  # where such a camera comes from
 WRONG = 8.0  # px, of points that do not fit together
 UNSURE = 10.0  # how many standard deviations gravity must be from nothing in a piece
 SCALE = 0.75, 1.35  # accelerations relative to gravity beyond which a piece is no flight
 
 
-def read_points(path: Path) -> tuple[np.ndarray, np.ndarray, float | None]:
-    """Pixels [N, 2] and places [N, 3] m of a YAML file, and the focal length in px if it has one. Raises SdfsimError
-    for a file that is not of this form."""
+@dataclass(frozen=True)
+class Points:
+    """What was clicked in a film."""
+
+    pixels: np.ndarray  # [N, 2] px of the upright film
+    places: np.ndarray  # [N, 3] m
+    horizon: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))  # [H, 2] px
+    focal: float | None = None  # px
+
+    def smaller(self, by: float) -> Points:
+        """As clicked in a film whose sides are this much smaller."""
+        return Points(self.pixels / by, self.places, self.horizon / by, self.focal and self.focal / by)
+
+
+def read_points(path: Path) -> Points:
+    """Points of a YAML file. Raises SdfsimError for a file that is not of this form."""
     try:
         data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        pairs = [(one["pixel"], one["place"]) for one in data["points"]]
-        pixels, places = (np.array(part, dtype=np.float64) for part in zip(*pairs, strict=True))
-        focal = data.get("focal")
-        if pixels.shape[1:] != (2,) or places.shape[1:] != (3,) or len(pixels) < LEAST or (focal or 1.0) <= 0:
+        points, level = ([one for one in data["points"] if (one["place"] == "horizon") == far] for far in (False, True))
+        pixels, places, horizon = (
+            np.array([one[key] for one in some], dtype=np.float64).reshape(len(some), -1)
+            for some, key in ((points, "pixel"), (points, "place"), (level, "pixel"))
+        )
+        found = Points(pixels, places, horizon.reshape(-1, 2), data.get("focal"))
+        enough = len(points) >= (LEAST_LEVEL if len(level) >= LEAST_LEVEL else LEAST)
+        if pixels.shape[1:] != (2,) or places.shape[1:] != (3,) or not enough or (found.focal or 1.0) <= 0:
             raise ValueError
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"must hold points, at least {LEAST}, each with pixel: [x, y] and place: [x, y, z] (m)"
+        what = (
+            f"must hold points, at least {LEAST}, each with pixel: [x, y] and place: [x, y, z] (m), or at least "
+            f"{LEAST_LEVEL} such and {LEAST_LEVEL} with place: horizon"
+        )
         raise SdfsimError(f"{path}: {what}", "docs/identify.md shows such a file") from error
-    return pixels, places, focal
+    return found
 
 
-def of_points(pixels: np.ndarray, places: np.ndarray, focal: float | None, size: tuple[int, int], name: str) -> Eye:
+def of_points(points: Points, size: tuple[int, int], name: str) -> Eye:
     """The camera that sees points at these pixels; the focal length is found with it, by what is usual and, if given,
     to 2 %. Raises SdfsimError if no camera does."""
-    import cv2
     from scipy.optimize import least_squares
 
     wide, high = size
-    longer = max(size)
-    usual, spread = (np.log(focal), 0.02) if focal else (np.log(LENS[0] * longer), LENS[1])
+    longer, places = max(size), points.places
+    usual, spread = (np.log(points.focal), 0.02) if points.focal else (np.log(LENS[0] * longer), LENS[1])
     best, rest = None, None
-    for guess in [focal] if focal else np.geomspace(0.5, 2.5, 9) * longer:
-        lens = np.array([[guess, 0, wide / 2], [0, guess, high / 2], [0, 0, 1.0]])
-        for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
-            done, turn, shift = cv2.solvePnP(places, pixels, lens, None, flags=method)
-            if not done or not np.isfinite(shift).all():
-                continue
-            start = Eye(cv2.Rodrigues(turn)[0], shift[:, 0], float(guess), wide, high, np.zeros((WAYS, 0)), name)
+    for guess in [points.focal] if points.focal else np.geomspace(0.5, 2.5, 9) * longer:
+        for turn, shift in _posed(points, float(guess), 0.5 * np.array(size)):
+            start = Eye(turn, shift, float(guess), wide, high, np.zeros((WAYS, 0)), name)
 
             def off(change: np.ndarray, start: Eye = start) -> np.ndarray:
                 eye = start.moved(change)
-                at = (eye.project(places) - pixels) / CLICK
-                return np.r_[np.nan_to_num(at, nan=1e3).ravel(), (np.log(eye.focal) - usual) / spread]
+                at = np.nan_to_num((eye.project(places) - points.pixels) / CLICK, nan=1e3)
+                up = eye.rotation[:, 2]
+                far = eye.rays(*points.horizon.T) @ up * eye.focal / max(float(np.hypot(*up[:2])), 1e-6)
+                return np.r_[at.ravel(), far / FAR, (np.log(eye.focal) - usual) / spread]
 
             found = least_squares(off, np.zeros(WAYS), x_scale="jac")
             eye = start.moved(found.x)
@@ -75,7 +93,7 @@ def of_points(pixels: np.ndarray, places: np.ndarray, focal: float | None, size:
         raise SdfsimError(
             f"{name}: no camera sees these points at these pixels ({mean:.1f} px off)", "check the points"
         )
-    freedom = max(1, 2 * len(places) - WAYS)
+    freedom = max(1, 2 * len(places) + len(points.horizon) - WAYS)
     chi = max(1.0, float(np.square(rest.fun[:-1]).sum()) / freedom)
     normal = rest.jac.T @ rest.jac
     covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal))) * chi
@@ -83,6 +101,36 @@ def of_points(pixels: np.ndarray, places: np.ndarray, focal: float | None, size:
     at_best = np.eye(WAYS)  # changes about `start` are those about `best` to first order
     doubt = at_best @ vectors * np.sqrt(np.maximum(values, 0.0))
     return Eye(best.rotation, best.translation, best.focal, wide, high, doubt, name)
+
+
+def _posed(points: Points, focal: float, middle: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """First guesses of a camera: rotations [3, 3] of the world to it, and translations [3] m."""
+    import cv2
+
+    if len(points.places) >= LEAST:
+        lens = np.array([[focal, 0, middle[0]], [0, focal, middle[1]], [0, 0, 1.0]])
+        for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
+            done, turn, shift = cv2.solvePnP(points.places, points.pixels, lens, None, flags=method)
+            if done and np.isfinite(shift).all():
+                yield cv2.Rodrigues(turn)[0], shift[:, 0]
+    if len(points.horizon) >= LEAST_LEVEL:
+        # The rays to the horizon are level, so the vertical is known; each turn about it leaves a linear problem.
+        rays, far = (np.c_[(at - middle) / focal, np.ones(len(at))] for at in (points.pixels, points.horizon))
+        up = np.linalg.svd(far)[2][2]
+        up = -up if up[1] > 0 else up
+        aside = np.linalg.svd(up[None])[2][1:]
+        aside[1] *= np.sign(np.linalg.det(np.c_[aside.T, up]))
+        across = np.cross(np.eye(3), rays[:, None]).transpose(0, 2, 1)  # [N, 3, 3]: v -> ray x v
+        found = []
+        for yaw in np.arange(YAWS) * 2 * np.pi / YAWS:
+            first = np.cos(yaw) * aside[0] + np.sin(yaw) * aside[1]
+            turn = np.stack([first, np.cross(up, first), up], 1)
+            seen = np.einsum("nij,jk,nk->ni", across, turn, points.places).ravel()
+            shift = -np.linalg.lstsq(across.reshape(-1, 3), seen, rcond=None)[0]
+            depth = (points.places @ turn.T + shift)[:, 2]
+            rest = np.square(across.reshape(-1, 3) @ shift + seen).sum() / max(float(np.square(depth).sum()), 1e-12)
+            found.append((rest if (depth > 0).all() else np.inf, turn, shift))
+        yield min(found, key=lambda one: one[0])[1:]
 
 
 def level(clip: Clip) -> Eye:

@@ -67,11 +67,10 @@ def watched(
     led = [body for body in scene.bodies if body.motion == "kinematic" and body.name in names]
     room = photos_of(scene.path)
     if points is not None:
-        pixels, places, focal = read_points(Path(points))
-        eye = of_points(pixels / clip.smaller, places, focal and focal / clip.smaller, size, str(points))
+        eye = of_points(read_points(Path(points)).smaller(clip.smaller), size, str(points))
     elif room is not None:
         still = np.median(clip.pixels[:: max(1, len(clip.time) // 15)], 0).astype(np.uint8)
-        eye = of_points(*of_room(still, room, str(path)), None, size, f"the photos of {room}")
+        eye = of_points(of_room(still, room, str(path)), size, f"the photos of {room}")
     elif len(looks) == 1 and looks[0].ball and not led:
         eye = level(clip)
     else:

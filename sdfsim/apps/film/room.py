@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sdfsim.apps.film.camera import Points
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, read_json
 
@@ -24,8 +25,8 @@ def photos_of(scene: Path | None) -> Path | None:
     return folder if folder is not None and all((folder / name).exists() for name in needed) else None
 
 
-def of_room(pixels: np.ndarray, folder: Path, name: str, without: int = -1) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [N, 2] of a picture [H, W, 3] uint8 at which it shows places [N, 3] m of a reconstructed room: features
+def of_room(pixels: np.ndarray, folder: Path, name: str, without: int = -1) -> Points:
+    """Where a picture [H, W, 3] uint8 shows places of a reconstructed room: features
     that look like those of its photos (`without` one), as far as one camera sees them all. Raises SdfsimError if there
     are too few."""
     import cv2
@@ -48,7 +49,7 @@ def of_room(pixels: np.ndarray, folder: Path, name: str, without: int = -1) -> t
             f"{name}: only {len(chosen)} features of the room are found in it (at least {ENOUGH})",
             "film more of what the photos show, or give points of known places: --points",
         )
-    return np.array(seen)[chosen], np.array(found)[chosen]
+    return Points(np.array(seen)[chosen], np.array(found)[chosen])
 
 
 def _features(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

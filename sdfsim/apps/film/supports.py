@@ -3,6 +3,7 @@ are found on them."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,7 +26,7 @@ from sdfsim.scene.scene import Body, Scene, Waypoints
 # px, from coarse to fine: by how much pictures are smeared, and a margin around the body that its background lacks.
 BEGIN = ((4.0, 8.0), (1.5, 4.0), (0.0, 2.0))
 MENDED = 5  # px around a hole that its mending looks at
-VIEWS = 7  # frames that show how a face looks; what lies on it is in few of them at the same place
+VIEWS = 7  # frames that show how a face looks
 FULL = 0.98  # share of a pixel from which what is behind it does not matter
 BRIGHTER = 0.5, 2.0  # limits of how brightnesses of a face differ
 
@@ -75,11 +76,14 @@ def behind_others(
     every = [either([of[k] for of in (*around, *([covered] if covered else []))]) for k in range(len(clip.time))]
     back = background(clip, every, complete=covered is not None)
     tracks = [again(clip, back, eye, shutter, one, covered) for one in tracks]
-    front: Front = partial(_drawn, clip, eye, shutter, tracks)
+    front: Front = partial(_drawn, clip, eye, shutter, tracks, covered)
     return tracks, replace(back, front=front)
 
 
-def _drawn(clip: Clip, eye: Eye, shutter: Shutter, tracks: Sequence[Track], still: np.ndarray, k: int) -> np.ndarray:
+def _drawn(
+    clip: Clip, eye: Eye, shutter: Shutter, tracks: Sequence[Track], covered: Sequence[np.ndarray | None] | None,
+    still: np.ndarray, k: int,
+) -> np.ndarray:  # fmt: skip
     """A background [H, W, 3] with the supports where they are in frame k."""
     still = still.copy()
     for one in tracks:
@@ -89,15 +93,18 @@ def _drawn(clip: Clip, eye: Eye, shutter: Shutter, tracks: Sequence[Track], stil
             continue
         cover = smear(one.look.cover(eye, seen.place, seen.turn, at), np.zeros(2), shutter.spread)
         total = cover.sum(0)[..., None]
-        own = sum(part[..., None] * _face(clip, eye, one, k, n, at) for n, part in enumerate(cover))
+        own = sum(part[..., None] * _face(clip, eye, one, covered, k, n, at) for n, part in enumerate(cover))
         under = still[at.rows, at.columns]
         mixed = (1.0 - total) * under + own
         still[at.rows, at.columns] = np.where(total > FULL, own / np.maximum(total, FULL), mixed)
     return still
 
 
-def _face(clip: Clip, eye: Eye, track: Track, k: int, n: int, at: Window) -> np.ndarray:
-    """[h, w, 3] what a flat face looks like in a part of frame k: as in other frames, moved there."""
+def _face(
+    clip: Clip, eye: Eye, track: Track, covered: Sequence[np.ndarray | None] | None, k: int, n: int, at: Window
+) -> np.ndarray:
+    """[h, w, 3] what a flat face looks like in a part of frame k: as in other frames, moved there. As long as it is not
+    known what lies on it where (`covered`), each pixel is taken from the frame in which it is most like the face."""
     look, now = track.look, track.at(k)
     color = now.color[n].astype(np.float32)
     if not look.faces or color.min() <= 0.0:
@@ -121,10 +128,20 @@ def _face(clip: Clip, eye: Eye, track: Track, k: int, n: int, at: Window) -> np.
         lead = corner @ lens @ plane @ np.linalg.inv(lens) @ half
         size = (at.right - at.left, at.bottom - at.top)
         ratio = np.clip(color / then.color[n], *BRIGHTER).astype(np.float32)
-        views.append(ratio * cv2.warpPerspective(clip.pixels[j], lead, size, borderMode=cv2.BORDER_REPLICATE))
+        view = ratio * cv2.warpPerspective(clip.pixels[j], lead, size, borderMode=cv2.BORDER_REPLICATE)
+        cover = covered[j] if covered else None
+        if cover is not None:
+            view[cv2.warpPerspective(cover.astype(np.uint8), lead, size) > 0] = np.nan
+        views.append(view)
     if len(views) < 3:
         return np.broadcast_to(color, (at.bottom - at.top, at.right - at.left, 3))
-    return np.median(views, 0)
+    if covered is None:
+        nearest = np.abs(np.stack(views) - color).max(-1).argmin(0)
+        return np.take_along_axis(np.stack(views), nearest[None, ..., None], 0)[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # where something always lies on it
+        usual = np.nanmedian(views, 0)
+    return np.where(np.isnan(usual), color, usual)
 
 
 def with_paths(clip: Clip, eye: Eye, scene: Scene, tracks: Sequence[Track]) -> Scene:

@@ -21,8 +21,9 @@ from sdfsim.physics import pose
 from sdfsim.scene.scene import Scene
 
 STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things that move there, and orientations
+FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
-TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely what it does not have is
+TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
@@ -114,6 +115,7 @@ def find(
     begun = begun and fitted(look, eye, frame, begun.place, begun.turn, none, 0.7, None)
     if begun is not None:
         found.append((0, begun))
+        turns = turns[: 1 + FEWER] if begun.score > GOOD else turns
     for k in np.unique(np.linspace(0, len(clip.time) - 1, STARTS + 2)[1:-1].astype(int)).tolist():
         frame = frame_of(clip, back, k)
         # A place where the body rests for long, before or after, differs from the median when it is free.
@@ -141,7 +143,7 @@ def find(
     def unlikely(item: tuple[int, Seen]) -> float:
         """A thin or small body looks alike from two sides, and others move too: what the scene has is more likely."""
         if item[1] is begun:
-            return (1.0 - item[1].score) / OTHERWISE
+            return (1.0 - item[1].score) / OTHERWISE**2
         way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
         return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
 
@@ -205,14 +207,15 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         return None
     best = None
     color = before[0][1].color
-    tries: list[tuple[Any, ...]] = [(*guess, 0.0) for guess in predicted(clip, eye, shutter, at, before, gravity)]
-    tries += [(*guess, 2.5) for *guess, _ in tries]
+    likely = predicted(clip, eye, shutter, at, before, gravity)
+    tries: list[tuple[Any, ...]] = [(*guess, wide) for wide in (0.0, 2.5) for guess in likely]
     depth = float(eye.seen(before[0][1].place)[2])
     for blob, _ in [] if look.support else blobs(frame)[:2]:  # something pushed it: it may be anywhere, and rebound
         there = (eye.rays(*blob) * depth - eye.translation) @ eye.rotation
         tries += [(there, tries[0][1], flow, 2.5) for flow in (np.zeros(2), tries[0][2] * REBOUND)]
-    for place, turn, flow, wide in tries:
-        if best is not None and best.score > GOOD:
+    for n, (place, turn, flow, wide) in enumerate(tries):
+        # All predictions are tried: where pictures show depth and tilt badly, one alone leads from wrong to worse.
+        if best is not None and best.score > GOOD and n >= len(likely):
             break
         one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide)
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
@@ -231,7 +234,7 @@ def _repainted(look: Look, one: Seen, first: Seen) -> bool:
 
 def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Places, turns, and flows while the shutter is open, from up to three frames before, the last one first: as after
-    a flight, and at the same speed."""
+    a flight, at the same speed, and in the last pose."""
     (k, last), time = before[0], clip.time
     if len(before) == 1:
         return [(last.place, last.turn, np.zeros(2))]
@@ -247,7 +250,7 @@ def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray,
             place - (now + later * pull) * 0.5 * shutter.open
         )
         found.append((place, turn, way))
-    return found
+    return [*found, (last.place, last.turn, found[0][2])]
 
 
 def at_edge(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> bool:

@@ -248,7 +248,7 @@ def scripted(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: i
         return NO_SCRIPT, times[-1]
     instants = np.array([[t + inner * k for k in range(count)] for t in times[:-1]])
     after, half = np.array(times[1:])[:, None], 0.5 * inner
-    place, turn = _at(tracks, np.concatenate([instants, after, after - half, after + half], 1))
+    place, turn = tracks.at(np.concatenate([instants, after, after - half, after + half], 1))
     speeds = np.empty((steps, count + 1, len(tracks.body), 6))
     for k, (one, other) in enumerate([*((k, k + 1) for k in range(count)), (count + 1, count + 2)]):
         speeds[:, k, :, :3] = place[:, other] - place[:, one]
@@ -256,13 +256,6 @@ def scripted(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: i
     # An array of another layout would cause another compilation.
     ends = np.ascontiguousarray(np.concatenate([place, turn], -1)[:, count])
     return Script(tracks.body, ends, speeds / inner), times[-1]
-
-
-def _at(tracks: Tracks, instants: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Positions [n, m, S, 3] and orientations [n, m, S, 4] at instants [n, m]."""
-    found = zip(*map(tracks.at, instants.flat), strict=True)
-    place, turn = (np.stack(part) for part in found)
-    return place.reshape(*instants.shape, -1, 3), turn.reshape(*instants.shape, -1, 4)
 
 
 def taken_up(state: State) -> tuple[compiled.Motion, compiled.Manifolds]:
