@@ -47,11 +47,9 @@ def read_points(path: Path) -> Points:
     try:
         data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         points, level = ([one for one in data["points"] if (one["place"] == "horizon") == far] for far in (False, True))
-        pixels, places, horizon = (
-            np.array([one[key] for one in some], dtype=np.float64).reshape(len(some), -1)
-            for some, key in ((points, "pixel"), (points, "place"), (level, "pixel"))
-        )
-        found = Points(pixels, places, horizon.reshape(-1, 2), data.get("focal"))
+        pixels, places = (np.array([one[key] for one in points], dtype=np.float64) for key in ("pixel", "place"))
+        horizon = np.array([one["pixel"] for one in level], dtype=np.float64).reshape(len(level), 2)
+        found = Points(pixels, places, horizon, data.get("focal"))
         enough = len(points) >= (LEAST_LEVEL if len(level) >= LEAST_LEVEL else LEAST)
         if pixels.shape[1:] != (2,) or places.shape[1:] != (3,) or not enough or (found.focal or 1.0) <= 0:
             raise ValueError

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numba import njit
 
 from sdfsim.apps.film.eye import Eye
+from sdfsim.base.compiling import cache_of, kept
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, area_vectors
 from sdfsim.physics import pose
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import SphereSdf
 
-SAMPLES = 2  # rays a side of a pixel
+SAMPLES, LINES = 2, 8  # rays a side of a pixel, and lines
 FACES, LARGE = 8, 0.05  # most parts with a colour of their own; least share of the surface of one
 
 
@@ -97,17 +101,13 @@ class Look:
             away = pose.rotate(
                 pose.conjugate(turn), -eye.rotation.T @ eye.translation - place
             )  # the camera, shape axes
-            pixel = eye.focal * seen[:, :2] / seen[:, 2:] + eye.middle
-            x, y = at.left + np.arange(wide) + 0.5, at.top + np.arange(high)[:, None] + 0.5
+            pixel = eye.focal * seen[:, :2] / seen[:, 2:] + eye.middle - (at.left, at.top)
             found = np.zeros((self.parts, high, wide), np.float32)
             for k, rows in enumerate(self.faces):
                 if self.normals[k] @ away > self.heights[k]:
-                    around = cv2.convexHull(pixel[rows].astype(np.float32))[:, 0].astype(np.float64)
-                    inside = np.full((high, wide), np.inf)
-                    for (ax, ay), (bx, by) in zip(around, np.roll(around, -1, 0), strict=True):
-                        length = max(float(np.hypot(bx - ax, by - ay)), 1e-6)
-                        inside = np.minimum(inside, ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / length)
-                    found[k] = np.clip(inside + 0.5, 0.0, 1.0)
+                    found[k] = _covered(
+                        cv2.convexHull(pixel[rows].astype(np.float32))[:, 0].astype(np.float64), high, wide
+                    )
             return found
         x = at.left + (np.arange(SAMPLES * wide) + 0.5) / SAMPLES
         y = at.top + (np.arange(SAMPLES * high) + 0.5)[:, None] / SAMPLES
@@ -119,6 +119,28 @@ class Look:
         part = np.where(np.isfinite(away), self.part[np.minimum(face, len(self.part) - 1)], -1)
         part = part.reshape(high, SAMPLES, wide, SAMPLES)
         return np.stack([(part == k).mean((1, 3)) for k in range(self.parts)]).astype(np.float32)
+
+
+with kept(cache_of([Path(__file__)])):
+
+    @njit(cache=True)
+    def _covered(around, high, wide):
+        """[high, wide] the share of each pixel that a convex polygon [N, 2] px covers: of lines in it, exactly."""
+        found = np.zeros((high, wide), np.float32)
+        low, top = around[:, 1].min(), around[:, 1].max()
+        for line in range(high * LINES):
+            begin, end = max(line / LINES, low), min((line + 1) / LINES, top)
+            if end <= begin:
+                continue
+            y, left, right = 0.5 * (begin + end), np.inf, -np.inf
+            for k in range(len(around)):
+                (ax, ay), (bx, by) = around[k - 1], around[k]
+                if min(ay, by) <= y <= max(ay, by) and ay != by:
+                    x = ax + (y - ay) / (by - ay) * (bx - ax)
+                    left, right = min(left, x), max(right, x)
+            for i in range(max(0, math.floor(left)), min(wide, math.ceil(right))):
+                found[line // LINES, i] += (end - begin) * (min(right, i + 1) - max(left, i))
+        return found
 
 
 def _planes(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -23,6 +23,12 @@ MARGIN = 5.0  # px around a body that are compared
 FREE = 12.0  # levels by which a colour may differ from that in other frames
 SMEARED = 4.0  # radii: the longest smear
 LARGEST = 640  # px, sides of the part of a picture that is compared
+# Brightness and two differences of colour, from red, green and blue (ITU-R BT.601). Films keep a quarter of the pixels
+# of the latter, so outlines are smeared in them, by so many px.
+SPLIT = np.array([[0.299, 0.587, 0.114], [0.5, -0.4187, -0.0813], [-0.1687, -0.3313, 0.5]], np.float32)
+COARSE = 0.8
+DARKER, LIT = (0.2, 0.95), (0.6, 1.4)  # brightness of a shadow, and of a body in another light
+SHADE = 0.1  # weight of shadows
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -62,7 +68,10 @@ class Frame:
 
 def smear(cover: np.ndarray, flow: np.ndarray, spread: float) -> np.ndarray:
     """Covers [parts, h, w] of a body that moves by `flow` [2] px while the shutter is open."""
-    length = float(np.hypot(*flow))
+    length, seen = float(np.hypot(*flow)), np.flatnonzero(cover.any((1, 2)))
+    if (length <= 0.3 and spread <= 0.0) or not len(seen):
+        return cover
+    some = np.ascontiguousarray(np.moveaxis(cover[seen], 0, -1))
     if length > 0.3:
         half = int(np.ceil(length / 2)) + 1
         kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
@@ -71,28 +80,33 @@ def smear(cover: np.ndarray, flow: np.ndarray, spread: float) -> np.ndarray:
             left, top = int(x), int(y)
             across, down = x - left, y - top
             kernel[top : top + 2, left : left + 2] += np.outer([1 - down, down], [1 - across, across]) / n
-        cover = np.stack([cv2.filter2D(one, -1, kernel, borderType=cv2.BORDER_CONSTANT) for one in cover])
+        some = cv2.filter2D(some, -1, kernel, borderType=cv2.BORDER_CONSTANT)
     if spread > 0.0:
-        cover = np.stack([cv2.GaussianBlur(one, (0, 0), spread, borderType=cv2.BORDER_CONSTANT) for one in cover])
-    return cover
+        some = cv2.GaussianBlur(some, (0, 0), spread, borderType=cv2.BORDER_CONSTANT)
+    smeared = np.zeros_like(cover)
+    smeared[seen] = np.moveaxis(some.reshape(*cover.shape[1:], len(seen)), -1, 0)
+    return smeared
 
 
 class Comparison:
     """A frame and a body, about a first guess of its pose."""
 
     def __init__(
-        self, look: Look, eye: Eye, frame: Frame, at: Window, flow: np.ndarray, spread: float, wide: float = 0.0
-    ) -> None:
+        self, look: Look, eye: Eye, frame: Frame, at: Window, flow: np.ndarray, spread: float, wide: float = 0.0,
+        color: np.ndarray | None = None,
+    ) -> None:  # fmt: skip
         self.look, self.eye, self.at, self.flow, self.spread = look, eye, at, flow, float(np.hypot(spread, wide))
         still = frame.gain * frame.still[at.rows, at.columns]
         self.weight = np.isfinite(still[..., 0]).astype(np.float32)
         if frame.hidden is not None:
             self.weight *= ~frame.hidden[at.rows, at.columns]
-        self.still, now = np.nan_to_num(still), frame.pixels[at.rows, at.columns].astype(np.float32)
+        self.still, now = np.nan_to_num(still) @ SPLIT.T, frame.pixels[at.rows, at.columns] @ SPLIT.T
         if wide:
             self.still, now = (cv2.GaussianBlur(one, (0, 0), wide) for one in (self.still, now))
         self.off = now - self.still
         self.noise = frame.noise
+        if color is not None:
+            self.weight[_shaded(now, self.still, color[color.any(1)] @ SPLIT.T)] *= SHADE
 
     def cover(self, place: np.ndarray, turn: np.ndarray, eye: Eye | None = None) -> np.ndarray:
         return smear(self.look.cover(eye or self.eye, place, turn, self.at), self.flow, self.spread)
@@ -101,15 +115,18 @@ class Comparison:
         self, cover: np.ndarray, color: np.ndarray | None, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The best colours [basis, 3], and the remaining differences [h, w, 3] in standard deviations."""
-        basis = self.shaded(cover).reshape(-1, weight.size)
-        behind = cover.sum(0).reshape(-1, 1) * self.still.reshape(-1, 3)
-        w = weight.ravel()
-        known = np.zeros((len(basis), 3)) if color is None else color
-        pull = (1e-3 if color is None else (self.noise / FREE) ** 2) * np.eye(len(basis))
-        right = (basis * w) @ (self.off.reshape(-1, 3) + behind) + pull @ known
-        found = np.linalg.solve((basis * w) @ basis.T + pull, right)
-        rest = (self.off.reshape(-1, 3) + behind - basis.T @ found) / self.noise
-        return found, rest.reshape(self.off.shape)
+        coarse = smear(cover, np.zeros(2), COARSE)
+        known = None if color is None else color @ SPLIT.T
+        parts, w = [], weight.ravel()
+        for seen, of in ((cover, slice(0, 1)), (coarse, slice(1, 3))):
+            basis = self.shaded(seen).reshape(-1, weight.size)
+            right = (self.off[..., of] + seen.sum(0)[..., None] * self.still[..., of]).reshape(weight.size, -1)
+            pull = (1e-3 if known is None else (self.noise / FREE) ** 2) * np.eye(len(basis))
+            pulled = (basis * w) @ right + (0.0 if known is None else pull @ known[:, of])
+            found = np.linalg.solve((basis * w) @ basis.T + pull, pulled)
+            parts.append((found, (right - basis.T @ found) / self.noise))
+        found, rest = (np.concatenate(both, 1) for both in zip(*parts, strict=True))
+        return found @ np.linalg.inv(SPLIT).T, rest.reshape(self.off.shape)
 
     def shaded(self, cover: np.ndarray) -> np.ndarray:
         """[basis, h, w] the patterns of which the body's brightness is made: flat faces are even, and what is round is
@@ -128,6 +145,18 @@ class Comparison:
 
     def cost(self, rest: np.ndarray) -> float:
         return float((self.weight * np.log1p((rest**2).mean(-1) / ODD**2)).sum())
+
+
+def _shaded(now: np.ndarray, still: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """[h, w] whether a pixel [h, w, 3] is a darker background, by far rather than a body of these colours [K, 3] in
+    another light."""
+
+    def off(color: np.ndarray, least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
+        light = np.clip((now * color).sum(-1) / np.maximum((color * color).sum(-1), 1e-6), least, most)
+        return light, np.linalg.norm(now - light[..., None] * color, axis=-1)
+
+    light, rest = off(still, *DARKER)
+    return (light < DARKER[1]) & (rest < 0.5 * np.min([off(one, *LIT)[1] for one in colors] or [np.inf], 0))
 
 
 def moved(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -159,7 +188,7 @@ def fitted(
     at = look.window(eye, place, turn, MARGIN + 3.0 * wide + 0.6 * float(np.abs(flow).max()))
     if at is None or max(at.right - at.left, at.bottom - at.top) > LARGEST:
         return None
-    seen = Comparison(look, eye, frame, at, flow, spread, wide)
+    seen = Comparison(look, eye, frame, at, flow, spread, wide, color)
     damping = 1e-3
     cover = seen.cover(place, turn)
     color_now, rest = seen.explained(cover, color, seen.weight)
@@ -192,7 +221,8 @@ def fitted(
 
 
 def _slopes(seen: Comparison, place, turn, color, weight, rest) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives [ways, h, w, 3] of the differences, colours fitted again, and their normal equations."""
+    """Derivatives [ways, h, w, 3] of the differences, colours fitted again, and their normal equations. Steps to one
+    side only would lead a small box to poses in which it is tilted."""
     ways, slope = seen.look.ways, []
     for k in range(ways):
         by = np.zeros(ways)

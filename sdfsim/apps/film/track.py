@@ -24,6 +24,7 @@ STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things 
 FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
 TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
+JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
@@ -147,6 +148,8 @@ def find(
         way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
         return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
 
+    usual = _hue(begun if begun is not None and begun.score > GOOD else max(found, key=lambda item: item[1].score)[1])
+    found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE]
     k, best = min(found, key=unlikely)
     if free and _twins(found, look):
         raise SdfsimError(
@@ -157,11 +160,9 @@ def find(
 
 
 def _twins(found: list[tuple[int, Seen]], look: Look) -> bool:
-    """Whether two things that look like a body move in several frames. What only seems to move stays in its place: a
-    place that the body left, which the background still shows. A shadow has another colour."""
+    """Whether two things that look like a body, and have its colour, move in several frames. What only seems to move
+    stays in its place: a place that the body left, which the background still shows."""
     best: dict[int, list[Seen]] = {}
-    usual = _hue(max((one for _, one in found), key=lambda one: one.score))
-    found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE]
     for k, one in sorted(found, key=lambda item: -item[1].score):
         if one.score > TWIN and all(
             np.linalg.norm(one.place - other.place) > 2.0 * look.radius for other in best.get(k, [])
@@ -205,7 +206,7 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
                 if one is not None and one.score > GOOD and not _repainted(look, one, first):
                     return one
         return None
-    best = None
+    best, least = None, np.inf
     color = before[0][1].color
     likely = predicted(clip, eye, shutter, at, before, gravity)
     tries: list[tuple[Any, ...]] = [(*guess, wide) for wide in (0.0, 2.5) for guess in likely]
@@ -220,11 +221,18 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide)
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
-        if one is not None and (best is None or one.score > best.score) and not _repainted(look, one, first):
-            best = one
+        if one is not None and not _repainted(look, one, first) and odd(one, likely) < least:
+            best, least = one, odd(one, likely)
     if best is None or best.score < POOR or at_edge(look, eye, best.place, best.turn):
         return None
     return best
+
+
+def odd(one: Seen, likely: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float:
+    """How little a pose explains, and how far it is turned from all that is likely: a box seen from its front looks
+    nearly alike when it is tilted to either side."""
+    turns = [np.linalg.norm(pose.to_rotvec(pose.multiply(one.turn, pose.conjugate(turn)))) for _, turn, _ in likely]
+    return (1.0 - one.score) * (1.0 + float(min(turns)) / JUMP)
 
 
 def _repainted(look: Look, one: Seen, first: Seen) -> bool:
@@ -283,7 +291,8 @@ def again(
     seen = [None if only is not None and k not in only else one for k, one in enumerate(track.seen)]
     for k in [k for k in track.frames.tolist() if only is None or k in only]:
         frame, one = frame_of(clip, back, k, hidden[k] if hidden else None, 0), track.seen[k]
-        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, 0.5 * (color + one.color))
+        usual = 0.5 * (color + one.color)
+        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, usual)
         seen[k] = None if new is None or new.score < POOR or at_edge(track.look, eye, new.place, new.turn) else new
     return Track(track.look, seen)
 
