@@ -18,7 +18,7 @@ SKIN = np.array([196, 150, 120])
 
 def of_rollout(rollout: Rollout) -> Motion:
     def at(time: float) -> tuple[np.ndarray, np.ndarray]:
-        place, turn = between(rollout.time, rollout.position, rollout.orientation, np.array([time]))
+        place, turn = between(rollout.time, rollout.position, rollout.orientation, np.array([max(0.0, time)]))
         return place[0], turn[0]
 
     return at
@@ -45,7 +45,7 @@ def bouncing(
     starts = np.array([t for t, *_ in pieces])
 
     def at(time: float) -> tuple[np.ndarray, np.ndarray]:
-        t, p, v, _ = pieces[int(np.searchsorted(starts, time, "right")) - 1]
+        t, p, v, _ = pieces[max(0, int(np.searchsorted(starts, time, "right")) - 1)]
         later = time - t
         place = p + v * later - [0, 0, 0.5 * GRAVITY * later**2]
         place[2] = max(place[2], radius)
@@ -70,7 +70,7 @@ def filmed(
         for k in range(round(seconds * fps)):
             shots = []
             for part in (np.arange(subframes) + 0.5) / subframes - 0.5:
-                now = motion(max(0.0, (k + exposure * part) / fps))
+                now = motion((k + exposure * part) / fps)
                 if still is None or any(np.abs(a - b).max() > 1e-9 for a, b in zip(now, still[0], strict=True)):
                     still = now, camera.picture(scene, *now, style).color.astype(float)
                 shots.append(still[1])

@@ -18,7 +18,7 @@ from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.supports import behind_others, supported, with_paths
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, either, find, follow, masks, shutter_of
-from sdfsim.apps.identify.filmed import identify_films, motion_of
+from sdfsim.apps.identify.filmed import Filmed, identify_films, motion_of
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError, nearest
@@ -131,6 +131,23 @@ def identify_clips(
         watched(path, scene, points=points, slow=slow, start=start, end=end, bodies=bodies, on_progress=on_progress)
         for path in paths
     ]
+    films, fit = settled(films, on_progress)
+    if beside is not None:
+        first, motion = films[0], motion_of(fit.shots, fit.fit)
+        row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
+
+        def made(k: int, d: int) -> tuple[np.ndarray, np.ndarray] | None:
+            now = motion.get((0, int(row[k])))
+            return now and (now[0][d], now[1][d])
+
+        write_beside(first, made, beside)
+    notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
+    return replace(fit.found, notes=[*fit.found.notes, *notes])
+
+
+def settled(films: list[Film], on_progress: Progress = silent) -> tuple[list[Film], Filmed]:
+    """What films show, and the films with their cameras as the motion shows them. Raises SdfsimError for several films
+    of a support that is moved."""
     if len(films) > 1 and films[0].supports:
         raise SdfsimError("a support moves in its own way in each film", "identify from one film at a time")
     fit = identify_films([film.recording for film in films], films[0].scene, on_progress=on_progress)
@@ -147,17 +164,7 @@ def identify_clips(
         if closer.fit.cost > WORSE * fit.fit.cost:
             break
         films, fit = other, closer
-    if beside is not None:
-        first, motion = films[0], motion_of(fit.shots, fit.fit)
-        row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
-
-        def made(k: int, d: int) -> tuple[np.ndarray, np.ndarray] | None:
-            now = motion.get((0, int(row[k])))
-            return now and (now[0][d], now[1][d])
-
-        write_beside(first, made, beside)
-    notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
-    return replace(fit.found, notes=[*fit.found.notes, *notes])
+    return films, fit
 
 
 def _small(film: Film, change: np.ndarray) -> bool:

@@ -20,7 +20,9 @@ ROUNDS = 12
 TRY = 0.3  # px, steps of derivatives
 ODD = 3.0  # standard deviations beyond which a pixel counts less
 MARGIN = 5.0  # px around a body that are compared
-FREE = 12.0  # levels by which a colour may differ from that in other frames
+# px, of a face whose colour is half its own, and half that of other faces, or that which it had before: if it took the
+# background's, a body could turn as it likes.
+ALIKE, BEFORE = 1.0, 20.0
 SMEARED = 4.0  # radii: the longest smear
 LARGEST = 640  # px, sides of the part of a picture that is compared
 # Brightness and two differences of colour, from red, green and blue (ITU-R BT.601). Films keep a quarter of the pixels
@@ -28,7 +30,8 @@ LARGEST = 640  # px, sides of the part of a picture that is compared
 SPLIT = np.array([[0.299, 0.587, 0.114], [0.5, -0.4187, -0.0813], [-0.1687, -0.3313, 0.5]], np.float32)
 COARSE = 0.8
 DARKER, LIT = (0.2, 0.95), (0.6, 1.4)  # brightness of a shadow, and of a body in another light
-SHADE = 0.1  # weight of shadows
+LARGE = 0.15  # share of a body of faces whose colour is sure
+BESIDE, NEAR = 0.02, 0.05  # of a pixel that it covers beside itself, and of what is near that is a shadow
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -93,7 +96,6 @@ class Comparison:
 
     def __init__(
         self, look: Look, eye: Eye, frame: Frame, at: Window, flow: np.ndarray, spread: float, wide: float = 0.0,
-        color: np.ndarray | None = None,
     ) -> None:  # fmt: skip
         self.look, self.eye, self.at, self.flow, self.spread = look, eye, at, flow, float(np.hypot(spread, wide))
         still = frame.gain * frame.still[at.rows, at.columns]
@@ -103,10 +105,22 @@ class Comparison:
         self.still, now = np.nan_to_num(still) @ SPLIT.T, frame.pixels[at.rows, at.columns] @ SPLIT.T
         if wide:
             self.still, now = (cv2.GaussianBlur(one, (0, 0), wide) for one in (self.still, now))
-        self.off = now - self.still
-        self.noise = frame.noise
-        if color is not None:
-            self.weight[_shaded(now, self.still, color[color.any(1)] @ SPLIT.T)] *= SHADE
+        self.now, self.off, self.noise = now, now - self.still, frame.noise
+
+    def shade(self, cover: np.ndarray, color: np.ndarray) -> None:
+        """Darken the background where a shadow lies beside a body of this cover and these colours, and a little
+        further below it. Lines are edges of the body."""
+        beside = smear(cover, np.zeros(2), 1.0).sum(0) < BESIDE
+        size = cover.sum((1, 2))
+        colors = color[: len(size)][size > LARGE * size.sum()]
+        now, still = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (self.now, self.still))
+        dark, light = _shaded(now, still, colors @ SPLIT.T)
+        dark = cv2.morphologyEx((beside & dark).astype(np.float32), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        reach = 2.0 + 0.25 * float(np.hypot(*self.flow))
+        near, mean = (cv2.GaussianBlur(one.astype(np.float32), (0, 0), reach) for one in (dark, dark * light))
+        below = ~beside & (near > NEAR)
+        self.still = self.still * np.where(below, mean / np.maximum(near, NEAR), np.where(dark, light, 1.0))[..., None]
+        self.off = self.now - self.still
 
     def cover(self, place: np.ndarray, turn: np.ndarray, eye: Eye | None = None) -> np.ndarray:
         return smear(self.look.cover(eye or self.eye, place, turn, self.at), self.flow, self.spread)
@@ -116,14 +130,20 @@ class Comparison:
     ) -> tuple[np.ndarray, np.ndarray]:
         """The best colours [basis, 3], and the remaining differences [h, w, 3] in standard deviations."""
         coarse = smear(cover, np.zeros(2), COARSE)
-        known = None if color is None else color @ SPLIT.T
         parts, w = [], weight.ravel()
         for seen, of in ((cover, slice(0, 1)), (coarse, slice(1, 3))):
-            basis = self.shaded(seen).reshape(-1, weight.size)
-            right = (self.off[..., of] + seen.sum(0)[..., None] * self.still[..., of]).reshape(weight.size, -1)
-            pull = (1e-3 if known is None else (self.noise / FREE) ** 2) * np.eye(len(basis))
-            pulled = (basis * w) @ right + (0.0 if known is None else pull @ known[:, of])
-            found = np.linalg.solve((basis * w) @ basis.T + pull, pulled)
+            basis, total = self.shaded(seen).reshape(-1, weight.size), seen.sum(0)[..., None]
+            right = (self.off[..., of] + total * self.still[..., of]).reshape(weight.size, -1)
+            # What hardly shows is about as it was, or as the rest.
+            usual = np.zeros((len(basis), right.shape[1]))
+            inside = total.ravel() * w
+            usual[: len(cover)] = inside @ (self.off + self.still)[..., of].reshape(weight.size, -1)
+            usual /= max(float(inside.sum()), 1e-6)
+            if color is not None:
+                usual = np.where(color.any(1)[:, None], color @ SPLIT.T[:, of], usual)
+            pull = ALIKE if color is None else BEFORE
+            normal = (basis * w) @ basis.T + pull * np.eye(len(basis))
+            found = np.linalg.solve(normal, (basis * w) @ right + pull * usual)
             parts.append((found, (right - basis.T @ found) / self.noise))
         found, rest = (np.concatenate(both, 1) for both in zip(*parts, strict=True))
         return found @ np.linalg.inv(SPLIT).T, rest.reshape(self.off.shape)
@@ -147,16 +167,16 @@ class Comparison:
         return float((self.weight * np.log1p((rest**2).mean(-1) / ODD**2)).sum())
 
 
-def _shaded(now: np.ndarray, still: np.ndarray, colors: np.ndarray) -> np.ndarray:
+def _shaded(now: np.ndarray, still: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """[h, w] whether a pixel [h, w, 3] is a darker background, by far rather than a body of these colours [K, 3] in
-    another light."""
+    another light, and how dark it is."""
 
     def off(color: np.ndarray, least: float, most: float) -> tuple[np.ndarray, np.ndarray]:
         light = np.clip((now * color).sum(-1) / np.maximum((color * color).sum(-1), 1e-6), least, most)
         return light, np.linalg.norm(now - light[..., None] * color, axis=-1)
 
     light, rest = off(still, *DARKER)
-    return (light < DARKER[1]) & (rest < 0.5 * np.min([off(one, *LIT)[1] for one in colors] or [np.inf], 0))
+    return (light < DARKER[1]) & (rest < 0.5 * np.min([off(one, *LIT)[1] for one in colors] or [np.inf], 0)), light
 
 
 def moved(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -180,17 +200,20 @@ def axes(look: Look, eye: Eye, place: np.ndarray) -> np.ndarray:
 def fitted(
     look: Look, eye: Eye, frame: Frame, place: np.ndarray, turn: np.ndarray, flow: np.ndarray, spread: float,
     color: np.ndarray | None, *, rounds: int = ROUNDS, wide: float = 0.0,
+    shadows: bool = True,
 ) -> Seen | None:  # fmt: skip
     """The pose near a first guess that explains a frame best; `wide`: px by which both are smeared, for a guess that
-    is off by as much. None if the body is not in the picture."""
+    is off by as much; `shadows` beside the body are known by their colour. None if it is not in the picture."""
     most = SMEARED * look.radius * eye.focal / max(float(eye.seen(place)[2]), look.radius)
     flow = flow * min(1.0, most / max(float(np.hypot(*flow)), 1e-9))
     at = look.window(eye, place, turn, MARGIN + 3.0 * wide + 0.6 * float(np.abs(flow).max()))
     if at is None or max(at.right - at.left, at.bottom - at.top) > LARGEST:
         return None
-    seen = Comparison(look, eye, frame, at, flow, spread, wide, color)
+    seen = Comparison(look, eye, frame, at, flow, spread, wide)
     damping = 1e-3
     cover = seen.cover(place, turn)
+    if color is not None and shadows:
+        seen.shade(cover, color)
     color_now, rest = seen.explained(cover, color, seen.weight)
     weight = seen.robust(rest)
     color_now, rest = seen.explained(cover, color, weight)
@@ -256,9 +279,13 @@ def _seen(seen: Comparison, place, turn, color, rest, weight, slope, normal, pul
     to_world[:3, :3], to_world[3:, 3:] = scale[:, :3], scale[:, 3:]
     full = np.zeros((6, 6))
     full[: look.ways, : look.ways] = root
-    large, small = (np.abs(seen.off) ** 2).mean(-1), (rest**2).mean(-1) * seen.noise**2
+    before, small = (np.abs(seen.off) ** 2).mean(-1), (rest**2).mean(-1) * seen.noise**2
+    size = seen.cover(place, turn).sum((1, 2))
+    large = size > LARGE * size.sum()
+    color = color.copy()
+    color[: len(size)][~large] = size[large] @ color[: len(size)][large] / max(float(size[large].sum()), 1e-6)
     counts = weight if look.support else seen.weight  # what lies on a support is not explained by it
-    total = float((large * counts).sum())
+    total = float((before * counts).sum())
     score = 1.0 - float((small * counts).sum()) / max(total, 1e-9)
     if total < 4.0 * seen.noise**2 * seen.weight.size:
         score = min(score, 0.0)

@@ -24,6 +24,7 @@ STARTS, BLOBS, TURNS = 8, 3, 16  # frames in which a body is looked for, things 
 FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
 TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
+WORSE = 0.03  # score below the best, from which the best's orientation is tried again
 JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
@@ -223,6 +224,10 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
         if one is not None and not _repainted(look, one, first) and odd(one, likely) < least:
             best, least = one, odd(one, likely)
+    if best is not None and best.score < first.score - WORSE and not look.ball:  # it may have been mistaken before
+        likely = [(best.place, first.turn, likely[0][2]), *likely]
+        one = fitted(look, eye, frame, *likely[0], shutter.spread, color)
+        best = one if one is not None and odd(one, likely) < odd(best, likely) else best
     if best is None or best.score < POOR or at_edge(look, eye, best.place, best.turn):
         return None
     return best
@@ -283,7 +288,7 @@ def flows(clip: Clip, eye: Eye, track: Track, shutter: Shutter) -> dict[int, np.
 
 def again(
     clip: Clip, back: Background, eye: Eye, shutter: Shutter, track: Track,
-    hidden: Sequence[np.ndarray | None] | None = None, only: Sequence[int] | None = None,
+    hidden: Sequence[np.ndarray | None] | None = None, only: Sequence[int] | None = None, shadows: bool = True,
 ) -> Track:  # fmt: skip
     """The poses fitted again, with both neighbours' speeds, the film's usual colours, and another background."""
     speed = flows(clip, eye, track, shutter)
@@ -292,7 +297,7 @@ def again(
     for k in [k for k in track.frames.tolist() if only is None or k in only]:
         frame, one = frame_of(clip, back, k, hidden[k] if hidden else None, 0), track.seen[k]
         usual = 0.5 * (color + one.color)
-        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, usual)
+        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, usual, shadows=shadows)
         seen[k] = None if new is None or new.score < POOR or at_edge(track.look, eye, new.place, new.turn) else new
     return Track(track.look, seen)
 
@@ -304,7 +309,7 @@ def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
     some = fast[2 : max(10, len(fast) // 4) : max(1, len(fast) // 40)][:8]
 
     def rest(trial: Shutter) -> float:
-        found = again(clip, back, eye, trial, track, only=some)
+        found = again(clip, back, eye, trial, track, only=some, shadows=False)  # smears are dark beside it too
         return float(np.median([one.mean**2 if (one := found.seen[k]) else 1e3 for k in some]))
 
     best = Shutter(0.5 * clip.step, SPREADS[1])
