@@ -152,7 +152,8 @@ def sleepers(at: Setting) -> Iterator[Check]:
 
 
 def trays(at: Setting) -> Iterator[Check]:
-    """A cup stays on a tray that is sped up below the limit of friction, and slips by the surplus above it."""
+    """A cup stays on a tray that is sped up below the limit of friction, level or tilted, and slips by the surplus
+    above it."""
     for pull in (3.0, 4.2):
         path = [{"time": 0.1 + t, "position": (0.5 * pull * t * t, 0, 0)} for t in np.linspace(0, 1, 1001).tolist()]
         built = SceneBuilder(model="solver")
@@ -162,6 +163,19 @@ def trays(at: Setting) -> Iterator[Check]:
         behind = ran.rollout.position[-1, 0, 0] - ran.rollout.position[-1, 1, 0]
         wanted = max(0.0, 0.5 * (pull - 0.4 * G) * (ran.time[-1] - 0.1) ** 2)
         yield ran.near("behind", behind, wanted, 0.0, "m", 1e-3)
+    turn, mu = about("x", 20), 0.5  # the weight pulls down the tray, its acceleration along it: friction holds the sum
+    for share in (0.25, 0.4):
+        path = [{"time": 0.1 + t, "position": (0.5 * share * G * t * t, 0, 0), "quat_xyzw": turn.as_quat()}
+                for t in np.linspace(0, 1, 1001).tolist()]  # fmt: skip
+        built = SceneBuilder(model="solver")
+        built.add("tray", box={"size": (8, 1, 0.04)}, motion="kinematic", path=path, friction=1, restitution=0)
+        built.add("cup", cylinder={"radius": 0.05, "height": 0.08}, position=turn.apply((0, 0.2, 0.06)),
+                  quat_xyzw=turn.as_quat(), friction=mu, restitution=0)  # fmt: skip
+        ran = run_built(at, f"{share:g} g along a tray tilted by 20 degrees", built, 0.9)
+        slip = ran.rollout.position[-1] - ran.rollout.position[0]
+        surplus = max(0.0, sqrt(share**2 + sin(radians(20)) ** 2) - mu * cos(radians(20))) * G
+        wanted = 0.5 * surplus * (ran.time[-1] - 0.1) ** 2
+        yield ran.near("slips", np.linalg.norm(slip[1] - slip[0]), wanted, 0.02, "m", 1e-3)
 
 
 def soft(at: Setting) -> Iterator[Check]:
