@@ -58,7 +58,7 @@ FAULTS = (
     fault(
         "the cone of friction is a box",
         "rows.py",
-        "trays",
+        "cones",
         "length = math.sqrt(one * one + other * other)",
         "length = max(abs(one), abs(other))",
     ),

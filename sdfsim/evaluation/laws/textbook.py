@@ -1,11 +1,12 @@
 """Laws of a textbook in closed form: single bodies and stacks, tighter than in everyday scenes."""
 
 from collections.abc import Iterator
-from math import atan, cos, pi, radians, sin, sqrt, tan
+from math import atan, cos, inf, pi, radians, sin, sqrt, tan
 from typing import Any
 
 import numpy as np
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 
 from sdfsim.evaluation.laws.check import Check, most, near
 from sdfsim.evaluation.laws.scenes import DENSITY, STILL, UNIT, G, Put, Setting, about, floor, run, run_built, solid
@@ -178,6 +179,21 @@ def trays(at: Setting) -> Iterator[Check]:
         yield ran.near("slips", np.linalg.norm(slip[1] - slip[0]), wanted, 0.02, "m", 1e-3)
 
 
+def cones(at: Setting) -> Iterator[Check]:
+    """Coulomb's cone: what hits the ground, spinning, gains at most mu times as much momentum along it as away."""
+    rng, mu, shares = np.random.default_rng(5), 0.3, []
+    shapes = [at.box(*size) for size in ((1, 1, 1), (3, 0.3, 0.3), (2, 2, 0.2), (2, 1, 0.5))]
+    for _ in range(24):
+        speed = np.r_[rng.uniform(-0.6, 0.6, 2), -1.0]
+        put = Put("it", shapes[rng.integers(4)], [0, 0, 2.2], Rotation.random(rng=rng), v=speed,
+                  w=rng.uniform(-5, 5, 3), mu=mu, e=0.3)  # fmt: skip
+        ran = run(at, "throw", [put, floor()], 0.4, gravity=0.0)
+        gained = ran.v("it")[-1] - ran.v("it")[0]
+        shares += [float(np.hypot(*gained[:2])) / (mu * gained[2])] if gained[2] > 1e-6 else []
+    yield Check("24 throws: hits", len(shares), 12, 24)
+    yield most("24 throws: of mu times the normal", max(shares, default=inf), 1.001)
+
+
 def soft(at: Setting) -> Iterator[Check]:
     """Soft material gives way by its load over the stiffness, two of them in series, and rebounds as a spring."""
     for stiffness in (2e3, 1e4, 1e5, 1e7):
@@ -273,5 +289,5 @@ def rocking(at: Setting) -> Iterator[Check]:
 
 
 TEXTBOOK = (
-    bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays, soft, gliding, parting, rocking,
+    bounces, head_on, slopes, plates, drops, stacks, overlaps, sleepers, trays, cones, soft, gliding, parting, rocking,
 )  # fmt: skip
