@@ -12,13 +12,12 @@ from numba import njit
 
 from sdfsim.apps.film.eye import Eye
 from sdfsim.base.compiling import cache_of, kept
-from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, area_vectors
 from sdfsim.physics import pose
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import SphereSdf
 
-SAMPLES, LINES = 2, 8  # rays a side of a pixel, and lines
+SAMPLES, LINES = 4, 8  # places along a side of a pixel, and lines in it
 FACES, LARGE = 8, 0.05  # most parts with a colour of their own; least share of the surface of one
 
 
@@ -52,9 +51,8 @@ class Look:
         self.radius = self.ball or float(np.linalg.norm(vertices, axis=1).max())
         self.parts, self.round, self.faces = 1, True, []
         if not self.ball:
-            self.caster = Caster(Mesh(vertices, shape.mesh.faces))
             self.part = _parts(Mesh(vertices, shape.mesh.faces))
-            self.vertices, self.faces = vertices, []
+            self.vertices, self.mesh_faces, self.faces = vertices, shape.mesh.faces.astype(np.int64), []
             self.normals, self.heights = _planes(vertices, shape.mesh.faces, self.part)
             if (
                 (self.part.min() == 0)
@@ -109,16 +107,9 @@ class Look:
                         cv2.convexHull(pixel[rows].astype(np.float32))[:, 0].astype(np.float64), high, wide
                     )
             return found
-        x = at.left + (np.arange(SAMPLES * wide) + 0.5) / SAMPLES
-        y = at.top + (np.arange(SAMPLES * high) + 0.5)[:, None] / SAMPLES
-        into = pose.to_matrix(turn).T
-        rays = np.empty((SAMPLES * high, SAMPLES * wide, 6), np.float32)
-        rays[..., :3] = into @ (-eye.rotation.T @ eye.translation - place)
-        rays[..., 3:] = eye.rays(x, y) @ (eye.rotation @ into.T)
-        away, face, _ = self.caster.cast(rays.reshape(-1, 6))
-        part = np.where(np.isfinite(away), self.part[np.minimum(face, len(self.part) - 1)], -1)
-        part = part.reshape(high, SAMPLES, wide, SAMPLES)
-        return np.stack([(part == k).mean((1, 3)) for k in range(self.parts)]).astype(np.float32)
+        seen = eye.seen(pose.rotate(turn, self.vertices) + place)
+        pixel = eye.focal * seen[:, :2] / seen[:, 2:] + eye.middle - (at.left, at.top)
+        return _drawn(np.c_[pixel, 1.0 / seen[:, 2]], self.mesh_faces, self.part, self.parts, high, wide)
 
 
 with kept(cache_of([Path(__file__)])):
@@ -140,6 +131,36 @@ with kept(cache_of([Path(__file__)])):
                     left, right = min(left, x), max(right, x)
             for i in range(max(0, math.floor(left)), min(wide, math.ceil(right))):
                 found[line // LINES, i] += (end - begin) * (min(right, i + 1) - max(left, i))
+        return found
+
+    @njit(cache=True)
+    def _drawn(corners, faces, part, parts, high, wide):
+        """[parts, high, wide] the share of each pixel that parts of a mesh cover: of samples in it, by what is nearest.
+        `corners` [V, 3]: px, and one over the depth."""
+        near = np.zeros((SAMPLES * high, SAMPLES * wide))
+        which = np.full(near.shape, -1)
+        for f in range(len(faces)):
+            (ax, ay, a), (bx, by, b), (cx, cy, c) = corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]]
+            area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            if area == 0.0:
+                continue
+            left, right = min(ax, bx, cx) * SAMPLES - 0.5, max(ax, bx, cx) * SAMPLES - 0.5
+            top, low = min(ay, by, cy) * SAMPLES - 0.5, max(ay, by, cy) * SAMPLES - 0.5
+            for i in range(max(0, math.ceil(top)), min(SAMPLES * high - 1, math.floor(low)) + 1):
+                y = (i + 0.5) / SAMPLES
+                for j in range(max(0, math.ceil(left)), min(SAMPLES * wide - 1, math.floor(right)) + 1):
+                    x = (j + 0.5) / SAMPLES
+                    one = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
+                    two = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
+                    if one >= 0.0 and two >= 0.0 and one + two <= 1.0:
+                        nearness = one * a + two * b + (1.0 - one - two) * c
+                        if nearness > near[i, j]:
+                            near[i, j], which[i, j] = nearness, part[f]
+        found = np.zeros((parts, high, wide), np.float32)
+        for i in range(SAMPLES * high):
+            for j in range(SAMPLES * wide):
+                if which[i, j] >= 0:
+                    found[which[i, j], i // SAMPLES, j // SAMPLES] += 1.0 / SAMPLES**2
         return found
 
 
