@@ -142,20 +142,24 @@ with kept(cache_of([Path(__file__)])):
         for f in range(len(faces)):
             (ax, ay, a), (bx, by, b), (cx, cy, c) = corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]]
             area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-            if area == 0.0:
+            if area >= 0.0:  # it looks away
                 continue
-            left, right = min(ax, bx, cx) * SAMPLES - 0.5, max(ax, bx, cx) * SAMPLES - 0.5
-            top, low = min(ay, by, cy) * SAMPLES - 0.5, max(ay, by, cy) * SAMPLES - 0.5
-            for i in range(max(0, math.ceil(top)), min(SAMPLES * high - 1, math.floor(low)) + 1):
-                y = (i + 0.5) / SAMPLES
-                for j in range(max(0, math.ceil(left)), min(SAMPLES * wide - 1, math.floor(right)) + 1):
-                    x = (j + 0.5) / SAMPLES
-                    one = ((bx - x) * (cy - y) - (by - y) * (cx - x)) / area
-                    two = ((cx - x) * (ay - y) - (cy - y) * (ax - x)) / area
-                    if one >= 0.0 and two >= 0.0 and one + two <= 1.0:
-                        nearness = one * a + two * b + (1.0 - one - two) * c
-                        if nearness > near[i, j]:
-                            near[i, j], which[i, j] = nearness, part[f]
+            across = ((b - a) * (cy - ay) - (c - a) * (by - ay)) / area  # of 1 / depth, which is linear in a picture
+            down = ((c - a) * (bx - ax) - (b - a) * (cx - ax)) / area
+            low, top = min(ay, by, cy) * SAMPLES - 0.5, max(ay, by, cy) * SAMPLES - 0.5
+            for i in range(max(0, math.ceil(low)), min(SAMPLES * high - 1, math.floor(top)) + 1):
+                y, left, right = (i + 0.5) / SAMPLES, np.inf, -np.inf
+                for px, py, qx, qy in ((ax, ay, bx, by), (bx, by, cx, cy), (cx, cy, ax, ay)):
+                    if min(py, qy) <= y <= max(py, qy) and py != qy:
+                        x = px + (y - py) / (qy - py) * (qx - px)
+                        left, right = min(left, x), max(right, x)
+                if right < left:
+                    continue
+                first, last = math.ceil(left * SAMPLES - 0.5), math.floor(right * SAMPLES - 0.5)
+                for j in range(max(0, first), min(SAMPLES * wide - 1, last) + 1):
+                    nearness = a + across * ((j + 0.5) / SAMPLES - ax) + down * (y - ay)
+                    if nearness > near[i, j]:
+                        near[i, j], which[i, j] = nearness, part[f]
         found = np.zeros((parts, high, wide), np.float32)
         for i in range(SAMPLES * high):
             for j in range(SAMPLES * wide):
