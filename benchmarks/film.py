@@ -30,7 +30,7 @@ from sdfsim.base.files import read_json, write_json
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.simulate.camera import Camera
 
-SIZE = {"width": 320, "height": 240}
+WIDE, HIGH = 320, 240
 FIRST = 10  # of the draws: on the ten before it the solve's own uncertainty was chosen
 FAST = 0.3  # m/s, of what counts as a speed
 EVERY = 5  # photos of a room of which one is tried
@@ -60,7 +60,7 @@ def ball(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
     scene.add("ball", sphere={"radius": radius}, position=start, mass=0.1, color=color, restitution=0.6)
     motion = bouncing(start, [rng.uniform(0.2, 0.5), rng.uniform(-0.2, 0.2), 0], radius, restitution, 0.4)
     place = (rng.uniform(0.8, 1.3), rng.uniform(-1.8, -1.4), rng.uniform(0.4, 0.9))
-    camera = Camera(place, look_at=(0, 0, 0.3), fov=rng.uniform(36, 48), **SIZE)
+    camera = Camera(place, look_at=(0, 0, 0.3), fov=rng.uniform(36, 48), width=WIDE, height=HIGH)
     clip = filmed(folder / "clip.mp4", scene.load(), motion, camera, 1.4, **shown(rng, camera, start))
     return found_in(clip, scene, restitution, ("restitution", "ball / floor"), motion, camera)
 
@@ -86,7 +86,9 @@ def sliding(
     loaded = scene.load()
     low = loaded.shapes[loaded.bodies[1].shape].com[2]  # of the centre of mass above the shape's origin
     scene.bodies[1]["position"][2] = float(up - low)
-    camera = Camera((rng.uniform(0.2, 0.6), -1.1, rng.uniform(0.5, 0.8)), look_at=(0, 0, 0), fov=45, **SIZE)
+    camera = Camera(
+        (rng.uniform(0.2, 0.6), -1.1, rng.uniform(0.5, 0.8)), look_at=(0, 0, 0), fov=45, width=WIDE, height=HIGH
+    )
     places = np.array([[-0.4, -0.3, 0], [0.4, -0.3, 0], [0.4, 0.3, 0], [-0.4, 0.3, 0], [0, 0, 0], [-0.3, 0.2, 0.25]])
     pixels = camera.project(places)[0] + rng.normal(0, 0.5, (6, 2))
     points = [{"pixel": p.tolist(), "place": q.tolist()} for p, q in zip(pixels, places, strict=True)]

@@ -140,7 +140,7 @@ class Comparison:
             usual[: len(cover)] = inside @ (self.off + self.still)[..., of].reshape(weight.size, -1)
             usual /= max(float(inside.sum()), 1e-6)
             if color is not None:
-                usual = np.where(color.any(1)[:, None], color @ SPLIT.T[:, of], usual)
+                usual = np.where(np.asarray(color.any(1))[:, None], color @ SPLIT.T[:, of], usual)
             pull = ALIKE if color is None else BEFORE
             normal = (basis * w) @ basis.T + pull * np.eye(len(basis))
             found = np.linalg.solve(normal, (basis * w) @ right + pull * usual)

@@ -225,8 +225,9 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         if one is not None and not _repainted(look, one, first) and odd(one, likely) < least:
             best, least = one, odd(one, likely)
     if best is not None and best.score < first.score - WORSE and not look.ball:  # it may have been mistaken before
-        likely = [(best.place, first.turn, likely[0][2]), *likely]
-        one = fitted(look, eye, frame, *likely[0], shutter.spread, color)
+        place, turn, flow = best.place, first.turn, likely[0][2]
+        likely = [(place, turn, flow), *likely]
+        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color)
         best = one if one is not None and odd(one, likely) < odd(best, likely) else best
     if best is None or best.score < POOR or at_edge(look, eye, best.place, best.turn):
         return None
