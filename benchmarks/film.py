@@ -94,7 +94,7 @@ def sliding(
     points = [{"pixel": p.tolist(), "place": q.tolist()} for p, q in zip(pixels, places, strict=True)]
     (folder / "points.yaml").write_text(yaml.safe_dump({"points": points}))
     clip = filmed(folder / "clip.mp4", scene.load(), motion, camera, 1.0, **shown(rng, camera, [-0.35, 0, up]))
-    return found_in(clip, scene, friction, ("friction", "floor / thing"), motion, camera, folder / "points.yaml")
+    return found_in(clip, scene, friction, ("friction", "thing / floor"), motion, camera, folder / "points.yaml")
 
 
 def box(rng: np.random.Generator, folder: Path) -> dict[str, Any]:
