@@ -37,6 +37,7 @@ STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
 # What is known without the film, standard deviations, in the units of `Parameter`.
 KNOWN = {"inertia": 0.05, "size": 0.01, "tilt": math.radians(1.0), "mass": 1.0}
 LEVEL = 0.005  # m, of heights
+PATH = math.radians(0.4)  # tilts of bodies on paths: they are seen
 # Of coefficients, which no film is expected to show better: what rendered films were off by, beyond their poses.
 SLACK = {"friction": 0.01, "restitution": 0.0065}
 LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
@@ -188,7 +189,11 @@ class _Fit:
 def known_before(problem: Problem) -> np.ndarray:
     """[P] what is known of parameters without a film, standard deviations; infinite if nothing is."""
     known = KNOWN | {"height": LEVEL / problem.units.length}
-    return np.array([known.get(p.kind, math.inf) for p in problem.parameters])
+    led = [p.bodies and problem.bodies[p.bodies[0]].motion == "kinematic" for p in problem.parameters]
+    return np.array([
+        PATH if on_path and p.kind == "tilt" else known.get(p.kind, math.inf)
+        for p, on_path in zip(problem.parameters, led, strict=True)
+    ])  # fmt: skip
 
 
 class Fitting:
