@@ -22,7 +22,7 @@ ODD = 3.0  # standard deviations beyond which a pixel counts less
 MARGIN = 5.0  # px around a body that are compared
 # px, of a face whose colour is half its own, and half that of other faces, or that which it had before: if it took the
 # background's, a body could turn as it likes.
-ALIKE, BEFORE = 1.0, 20.0
+ALIKE, BEFORE = 3.0, 20.0
 SMEARED = 4.0  # radii: the longest smear
 LARGEST = 640  # px, sides of the part of a picture that is compared
 # Brightness and two differences of colour, from red, green and blue (ITU-R BT.601). Films keep a quarter of the pixels
@@ -31,7 +31,7 @@ SPLIT = np.array([[0.299, 0.587, 0.114], [0.5, -0.4187, -0.0813], [-0.1687, -0.3
 COARSE = 0.8
 DARKER, LIT = (0.2, 0.95), (0.6, 1.4)  # brightness of a shadow, and of a body in another light
 LARGE = 0.15  # share of a body of faces whose colour is sure
-BESIDE, NEAR = 0.02, 0.05  # of a pixel that it covers beside itself, and of what is near that is a shadow
+BESIDE, NEAR = 0.05, 0.05  # of a pixel that it covers beside itself, and of what is near that is a shadow
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -110,12 +110,12 @@ class Comparison:
     def shade(self, cover: np.ndarray, color: np.ndarray) -> None:
         """Darken the background where a shadow lies beside a body of this cover and these colours, and a little
         further below it. Lines are edges of the body."""
-        beside = smear(cover, np.zeros(2), 1.0).sum(0) < BESIDE
+        beside = smear(cover, np.zeros(2), 0.7).sum(0) < BESIDE
         size = cover.sum((1, 2))
         colors = color[: len(size)][size > LARGE * size.sum()]
         now, still = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (self.now, self.still))
         dark, light = _shaded(now, still, colors @ SPLIT.T)
-        dark = cv2.morphologyEx((beside & dark).astype(np.float32), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+        dark = cv2.morphologyEx((beside & dark).astype(np.float32), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
         reach = 2.0 + 0.25 * float(np.hypot(*self.flow))
         near, mean = (cv2.GaussianBlur(one.astype(np.float32), (0, 0), reach) for one in (dark, dark * light))
         below = ~beside & (near > NEAR)
@@ -141,8 +141,11 @@ class Comparison:
             usual /= max(float(inside.sum()), 1e-6)
             if color is not None:
                 usual = np.where(np.asarray(color.any(1))[:, None], color @ SPLIT.T[:, of], usual)
-            pull = ALIKE if color is None else BEFORE
-            normal = (basis * w) @ basis.T + pull * np.eye(len(basis))
+            pull = np.full((len(basis), 1), ALIKE)
+            if color is not None:
+                size = seen.sum((1, 2))
+                pull[: len(size), 0][size > LARGE * size.sum()] = BEFORE
+            normal = (basis * w) @ basis.T + np.diag(pull[:, 0])
             found = np.linalg.solve(normal, (basis * w) @ right + pull * usual)
             parts.append((found, (right - basis.T @ found) / self.noise))
         found, rest = (np.concatenate(both, 1) for both in zip(*parts, strict=True))
