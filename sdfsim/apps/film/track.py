@@ -25,6 +25,7 @@ FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
 TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
 WORSE = 0.03  # score below the best, from which the best's orientation is tried again
+SAME, SAME_TURN = 0.2, 0.01  # px, and rad, between predictions that count as one
 JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
@@ -264,7 +265,15 @@ def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray,
             place - (now + later * pull) * 0.5 * shutter.open
         )
         found.append((place, turn, way))
-    return [*found, (last.place, last.turn, found[0][2])]
+    distinct = found[:1]  # what is at rest or slow is predicted once
+    for place, turn, way in [*found[1:], (last.place, last.turn, found[0][2])]:
+        if all(
+            np.linalg.norm(place - other) > SAME * eye.seen(place)[2] / eye.focal
+            or np.linalg.norm(pose.to_rotvec(pose.multiply(turn, pose.conjugate(turned)))) > SAME_TURN
+            for other, turned, _ in distinct
+        ):
+            distinct.append((place, turn, way))
+    return distinct
 
 
 def at_edge(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> bool:
