@@ -22,7 +22,7 @@ ODD = 3.0  # standard deviations beyond which a pixel counts less
 MARGIN = 5.0  # px around a body that are compared
 # px, of a face whose colour is half its own, and half that of other faces, or that which it had before: if it took the
 # background's, a body could turn as it likes.
-ALIKE, BEFORE = 3.0, 20.0
+OTHERS, BEFORE = 3.0, 20.0
 SMEARED = 4.0  # radii: the longest smear
 LARGEST = 640  # px, sides of the part of a picture that is compared
 # Brightness and two differences of colour, from red, green and blue (ITU-R BT.601). Films keep a quarter of the pixels
@@ -31,7 +31,7 @@ SPLIT = np.array([[0.299, 0.587, 0.114], [0.5, -0.4187, -0.0813], [-0.1687, -0.3
 COARSE = 0.8
 DARKER, LIT = (0.2, 0.95), (0.6, 1.4)  # brightness of a shadow, and of a body in another light
 LARGE = 0.15  # share of a body of faces whose colour is sure
-BESIDE, NEAR = 0.05, 0.05  # of a pixel that it covers beside itself, and of what is near that is a shadow
+BESIDE, NEAR = 0.05, 0.05  # shares: of a pixel that the body may cover beside itself; of shadow nearby, to be one
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -141,7 +141,7 @@ class Comparison:
             usual /= max(float(inside.sum()), 1e-6)
             if color is not None:
                 usual = np.where(np.asarray(color.any(1))[:, None], color @ SPLIT.T[:, of], usual)
-            pull = np.full((len(basis), 1), ALIKE)
+            pull = np.full((len(basis), 1), OTHERS)
             if color is not None:
                 size = seen.sum((1, 2))
                 pull[: len(size), 0][size > LARGE * size.sum()] = BEFORE

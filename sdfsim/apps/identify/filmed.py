@@ -41,6 +41,7 @@ PATH = math.radians(0.4)  # tilts of bodies on paths: they are seen
 # Of coefficients, which no film is expected to show better: what rendered films were off by, beyond their poses.
 SLACK = {"friction": 0.01, "restitution": 0.0065}
 LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
+UNLIKE = 10.0  # standard deviations, of most poses, that no motion explains
 WORST = 4  # frames that are named
 TOLD = 0.7  # share of what was known before: a film that leaves more does not show it
 TYPICAL = 0.45  # median of a mean of squares of six standard normal numbers, of which some are unseen
@@ -464,7 +465,8 @@ def reported(
     estimates = estimates_of(problem, fit.values, covariance, shown)
     pixels = np.sqrt(np.square(off).mean(-1))
     notes = [
-        f"poses are off by {fit.mean:.2g} standard deviations (median) in {len(off)} windows",
+        f"poses are off by {fit.mean:.2g} standard deviations (median) in {len(off)} windows"
+        + (": the motion found is not that of the film" if fit.mean > UNLIKE else ""),
         *_worst(fitting.shots, pixels),
     ]
     return Identified(estimates, len(off), 0.0, {}, notes, *file_values(problem, fit.values))
