@@ -24,7 +24,6 @@ from benchmarks.records import Out, write_record
 from sdfsim.apps.film.camera import of_points
 from sdfsim.apps.film.film import settled, watched
 from sdfsim.apps.film.room import of_room
-from sdfsim.apps.identify.filmed import motion_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_json
 from sdfsim.scene.builder import SceneBuilder
@@ -134,14 +133,14 @@ def found_in(
     time, track = film.clip.time - film.clip.time[0], film.tracks[0]
     seen = film.eye.project(np.stack([track.at(k).place for k in track.frames]))
     pixels = np.linalg.norm(seen - camera.project(np.stack([motion(time[k])[0][1] for k in track.frames]))[0], axis=1)
-    fitted, dt = motion_of(fit.shots, fit.fit), film.recording.dt
+    fitted, dt = fit.motion(), film.recording.dt
     ways = [
         (np.linalg.norm(fitted[0, k + 1][0][0] - place[0]), np.linalg.norm(motion(dt * k + dt)[0] - motion(dt * k)[0]))
         for (_, k), (place, _) in fitted.items() if (0, k + 1) in fitted
     ]  # fmt: skip
     ratios = [found / true for found, true in ways if true > FAST * dt]
     also = {"px": float(np.median(pixels)), "speed": float(np.median(ratios)) if ratios else None}
-    one = {(e.kind, e.name): e for e in fit.found.estimates}[what]
+    one = {(e.kind, e.name): e for e in fit.shown().estimates}[what]
     if one.value is None or one.interval is None:
         return {"truth": truth, "said": "not shown"} | also
     return {"truth": truth, "found": one.value, "interval": list(one.interval)} | also

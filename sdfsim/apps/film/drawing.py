@@ -16,8 +16,10 @@ from sdfsim.geometry.mesh import Mesh, area_vectors
 from sdfsim.physics import pose
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.sdf.closed_forms import SphereSdf
+from sdfsim.shape.shape import Shape
 
 SAMPLES, LINES = 4, 8  # places along a side of a pixel, and lines in it
+EVEN = 0.02  # radii by which a turned body that looks alike may differ
 FACES, LARGE = 8, 0.05  # most parts with a colour of their own; least share of the surface of one
 
 
@@ -49,6 +51,7 @@ class Look:
         vertices = body.scale * (shape.mesh.vertices - shape.com)
         self.corners = vertices[:: max(1, len(vertices) // 500)]
         self.radius = self.ball or float(np.linalg.norm(vertices, axis=1).max())
+        self.axis = None if self.ball else _axis_of(shape)
         self.parts, self.round, self.faces = 1, True, []
         if not self.ball:
             self.part = _parts(Mesh(vertices, shape.mesh.faces))
@@ -61,11 +64,13 @@ class Look:
             ):
                 self.faces = [np.unique(shape.mesh.faces[self.part == k]) for k in range(int(self.part.max()) + 1)]
             self.parts, self.round = int(self.part.max()) + 1, bool((self.part == 0).sum() > 2)
+            area = area_vectors(vertices[shape.mesh.faces]) * (self.part == 0)[:, None]
+            self.bent = area / np.maximum(np.linalg.norm(area, axis=1), 1e-20)[:, None]  # normals of what is round
 
     @property
     def ways(self) -> int:
-        """How many of the six ways to move it pictures show: a ball's rotation is unseen."""
-        return 3 if self.ball else 6
+        """How many of the six ways to move it pictures show: not a ball's rotation, nor a cup's about its axis."""
+        return 3 if self.ball else 6 if self.axis is None else 5
 
     def window(self, eye: Eye, place: np.ndarray, turn: np.ndarray, margin: float) -> Window | None:
         """The part of the picture that holds it; None if it is behind the camera or outside."""
@@ -84,6 +89,11 @@ class Look:
 
     def cover(self, eye: Eye, place: np.ndarray, turn: np.ndarray, at: Window) -> np.ndarray:
         """[parts, h, w] float32: the share of each pixel that a part of it covers. `place`: its centre of mass."""
+        return self.patterns(eye, place, turn, at)[: self.parts]
+
+    def patterns(self, eye: Eye, place: np.ndarray, turn: np.ndarray, at: Window) -> np.ndarray:
+        """[basis, h, w] float32, of which its brightness is made: the cover of its parts, and if it is round, that of
+        the first times the normal there [3], as what is matt is lit (Lambert)."""
         if self.ball:
             x, y = np.arange(at.left, at.right) + 0.5, np.arange(at.top, at.bottom)[:, None] + 0.5
             ray = eye.rays(x, y)
@@ -92,7 +102,10 @@ class Look:
             along = ray @ centre / length
             aside = np.sqrt(np.maximum(centre @ centre - along**2, 0.0))
             inside = (self.ball - aside) / along * eye.focal * length
-            return np.clip(inside + 0.5, 0.0, 1.0)[None].astype(np.float32)
+            full = np.clip(inside + 0.5, 0.0, 1.0)
+            deep = along - np.sqrt(np.maximum(self.ball**2 - aside**2, 0.0))
+            normal = np.moveaxis(ray * (deep / length)[..., None] - centre, -1, 0) / self.ball
+            return np.concatenate([full[None], full * normal]).astype(np.float32)
         high, wide = at.bottom - at.top, at.right - at.left
         if self.faces:
             seen = eye.seen(pose.rotate(turn, self.vertices) + place)
@@ -109,7 +122,9 @@ class Look:
             return found
         seen = eye.seen(pose.rotate(turn, self.vertices) + place)
         pixel = eye.focal * seen[:, :2] / seen[:, 2:] + eye.middle - (at.left, at.top)
-        return _drawn(np.c_[pixel, 1.0 / seen[:, 2]], self.mesh_faces, self.part, self.parts, high, wide)
+        bent = pose.rotate(turn, self.bent) @ eye.rotation.T
+        found = _drawn(np.c_[pixel, 1.0 / seen[:, 2]], self.mesh_faces, self.part, self.parts, bent, high, wide)
+        return found if self.round else found[: self.parts]
 
 
 with kept(cache_of([Path(__file__)])):
@@ -134,9 +149,9 @@ with kept(cache_of([Path(__file__)])):
         return found
 
     @njit(cache=True)
-    def _drawn(corners, faces, part, parts, high, wide):
-        """[parts, high, wide] the share of each pixel that parts of a mesh cover: of samples in it, by what is nearest.
-        `corners` [V, 3]: px, and one over the depth."""
+    def _drawn(corners, faces, part, parts, bent, high, wide):
+        """[parts + 3, high, wide] the share of each pixel that parts of a mesh cover: of samples in it, by what is
+        nearest; and the sum there of `bent` [F, 3]. `corners` [V, 3]: px, and one over the depth."""
         near = np.zeros((SAMPLES * high, SAMPLES * wide))
         which = np.full(near.shape, -1)
         for f in range(len(faces)):
@@ -159,13 +174,28 @@ with kept(cache_of([Path(__file__)])):
                 for j in range(max(0, first), min(SAMPLES * wide - 1, last) + 1):
                     nearness = a + across * ((j + 0.5) / SAMPLES - ax) + down * (y - ay)
                     if nearness > near[i, j]:
-                        near[i, j], which[i, j] = nearness, part[f]
-        found = np.zeros((parts, high, wide), np.float32)
+                        near[i, j], which[i, j] = nearness, f
+        found = np.zeros((parts + 3, high, wide), np.float32)
         for i in range(SAMPLES * high):
             for j in range(SAMPLES * wide):
-                if which[i, j] >= 0:
-                    found[which[i, j], i // SAMPLES, j // SAMPLES] += 1.0 / SAMPLES**2
+                f = which[i, j]
+                if f >= 0:
+                    found[part[f], i // SAMPLES, j // SAMPLES] += 1.0 / SAMPLES**2
+                    for k in range(3):
+                        found[parts + k, i // SAMPLES, j // SAMPLES] += bent[f, k] / SAMPLES**2
         return found
+
+
+def _axis_of(shape: Shape) -> np.ndarray | None:
+    """[3] the axis about which a shape looks alike however it is turned; None if there is none."""
+    moments, axes = np.linalg.eigh(shape.inertia)
+    odd = 0 if abs(moments[2] - moments[1]) < abs(moments[1] - moments[0]) else 2
+    points = shape.mesh.vertices[:: max(1, len(shape.mesh.vertices) // 500)] - shape.com
+    for angle in (0.4, 1.1, 2.3):
+        turned = pose.rotate(pose.from_rotvec(angle * axes[:, odd]), points) + shape.com
+        if np.abs(shape.sdf(turned)[0]).max() > EVEN * np.linalg.norm(points, axis=1).max():
+            return None
+    return axes[:, odd]
 
 
 def _planes(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

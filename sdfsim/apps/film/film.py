@@ -18,7 +18,7 @@ from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.supports import behind_others, supported, with_paths
 from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, either, find, follow, masks, shutter_of
-from sdfsim.apps.identify.filmed import Filmed, identify_films, motion_of
+from sdfsim.apps.identify.filmed import Filmed, identify_films
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
 from sdfsim.base.errors import SdfsimError, nearest
@@ -133,7 +133,7 @@ def identify_clips(
     ]
     films, fit = settled(films, on_progress)
     if beside is not None:
-        first, motion = films[0], motion_of(fit.shots, fit.fit)
+        first, motion = films[0], fit.motion()
         row = np.round((first.clip.time - first.clip.time[0]) / first.recording.dt).astype(int)
 
         def made(k: int, d: int) -> tuple[np.ndarray, np.ndarray] | None:
@@ -142,7 +142,8 @@ def identify_clips(
 
         write_beside(first, made, beside)
     notes = [f"{film.clip.path.name}: {note}" for film in films for note in film.notes]
-    return replace(fit.found, notes=[*fit.found.notes, *notes])
+    found = fit.shown()
+    return replace(found, notes=[*found.notes, *notes])
 
 
 def settled(films: list[Film], on_progress: Progress = silent) -> tuple[list[Film], Filmed]:

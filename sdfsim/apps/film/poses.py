@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 
 from sdfsim.apps.film.drawing import Look, Window
 from sdfsim.apps.film.eye import WAYS, Eye
@@ -32,6 +33,9 @@ COARSE = 0.8
 DARKER, LIT = (0.2, 0.95), (0.6, 1.4)  # brightness of a shadow, and of a body in another light
 LARGE = 0.15  # share of a body of faces whose colour is sure
 BESIDE, NEAR = 0.05, 0.05  # shares: of a pixel that the body may cover beside itself; of shadow nearby, to be one
+HAND = 0.6  # share of what is around a body that differs from the background: then it is a part of something larger
+AROUND = 3  # px from a body's outline, where that is looked for
+UNLIKE = 5.0  # standard deviations of noise from which it differs
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -107,11 +111,11 @@ class Comparison:
             self.still, now = (cv2.GaussianBlur(one, (0, 0), wide) for one in (self.still, now))
         self.now, self.off, self.noise = now, now - self.still, frame.noise
 
-    def shade(self, cover: np.ndarray, color: np.ndarray) -> None:
-        """Darken the background where a shadow lies beside a body of this cover and these colours, and a little
+    def shade(self, patterns: np.ndarray, color: np.ndarray) -> None:
+        """Darken the background where a shadow lies beside a body of these patterns and colours, and a little
         further below it. Lines are edges of the body."""
-        beside = smear(cover, np.zeros(2), 0.7).sum(0) < BESIDE
-        size = cover.sum((1, 2))
+        beside = smear(patterns[: self.look.parts], np.zeros(2), 0.7).sum(0) < BESIDE
+        size = self.sizes(patterns)
         colors = color[: len(size)][size > LARGE * size.sum()]
         now, still = (cv2.GaussianBlur(one, (0, 0), 1.0) for one in (self.now, self.still))
         dark, light = _shaded(now, still, colors @ SPLIT.T)
@@ -122,46 +126,46 @@ class Comparison:
         self.still = self.still * np.where(below, mean / np.maximum(near, NEAR), np.where(dark, light, 1.0))[..., None]
         self.off = self.now - self.still
 
-    def cover(self, place: np.ndarray, turn: np.ndarray, eye: Eye | None = None) -> np.ndarray:
-        return smear(self.look.cover(eye or self.eye, place, turn, self.at), self.flow, self.spread)
+    def patterns(self, place: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        return smear(self.look.patterns(self.eye, place, turn, self.at), self.flow, self.spread)
+
+    def sizes(self, patterns: np.ndarray) -> np.ndarray:
+        """[parts] px, what each part covers."""
+        return patterns[: self.look.parts].sum((1, 2))
 
     def explained(
-        self, cover: np.ndarray, color: np.ndarray | None, weight: np.ndarray
+        self, patterns: np.ndarray, color: np.ndarray | None, weight: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The best colours [basis, 3], and the remaining differences [h, w, 3] in standard deviations."""
-        coarse = smear(cover, np.zeros(2), COARSE)
-        parts, w = [], weight.ravel()
-        for seen, of in ((cover, slice(0, 1)), (coarse, slice(1, 3))):
-            basis, total = self.shaded(seen).reshape(-1, weight.size), seen.sum(0)[..., None]
+        coarse = smear(patterns, np.zeros(2), COARSE)
+        found, w, parts = [], weight.ravel(), self.look.parts
+        for seen, of in ((patterns, slice(0, 1)), (coarse, slice(1, 3))):
+            basis, total = seen.reshape(-1, weight.size), seen[:parts].sum(0)[..., None]
             right = (self.off[..., of] + total * self.still[..., of]).reshape(weight.size, -1)
             # What hardly shows is about as it was, or as the rest.
             usual = np.zeros((len(basis), right.shape[1]))
             inside = total.ravel() * w
-            usual[: len(cover)] = inside @ (self.off + self.still)[..., of].reshape(weight.size, -1)
+            usual[:parts] = inside @ (self.off + self.still)[..., of].reshape(weight.size, -1)
             usual /= max(float(inside.sum()), 1e-6)
             if color is not None:
                 usual = np.where(np.asarray(color.any(1))[:, None], color @ SPLIT.T[:, of], usual)
             pull = np.full((len(basis), 1), OTHERS)
             if color is not None:
-                size = seen.sum((1, 2))
-                pull[: len(size), 0][size > LARGE * size.sum()] = BEFORE
+                size = self.sizes(seen)
+                pull[:parts, 0][size > LARGE * size.sum()] = BEFORE
             normal = (basis * w) @ basis.T + np.diag(pull[:, 0])
-            found = np.linalg.solve(normal, (basis * w) @ right + pull * usual)
-            parts.append((found, (right - basis.T @ found) / self.noise))
-        found, rest = (np.concatenate(both, 1) for both in zip(*parts, strict=True))
-        return found @ np.linalg.inv(SPLIT).T, rest.reshape(self.off.shape)
+            best = np.linalg.solve(normal, (basis * w) @ right + pull * usual)
+            found.append((best, (right - basis.T @ best) / self.noise))
+        best, rest = (np.concatenate(both, 1) for both in zip(*found, strict=True))
+        return best @ np.linalg.inv(SPLIT).T, rest.reshape(self.off.shape)
 
-    def shaded(self, cover: np.ndarray) -> np.ndarray:
-        """[basis, h, w] the patterns of which the body's brightness is made: flat faces are even, and what is round is
-        brighter towards a side."""
-        if not self.look.round:
-            return cover
-        high, wide = cover.shape[1:]
-        x, y = np.arange(wide), np.arange(high)[:, None]
-        total = max(float(cover[0].sum()), 1.0)
-        size = np.sqrt(total / np.pi)
-        across, down = ((axis - (cover[0] * axis).sum() / total) / size for axis in (x, y))
-        return np.concatenate([cover, [cover[0] * across, cover[0] * down]]).astype(np.float32)
+    def reaches(self, place: np.ndarray, turn: np.ndarray) -> float:
+        """The share of what is around the body that is not background: all of it if it is a part of a hand."""
+        cover = smear(self.patterns(place, turn)[: self.look.parts], np.zeros(2), 0.7).sum(0)
+        near = cv2.dilate((cover > 0.5).astype(np.uint8), np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)) > 0
+        around = near & (cover < BESIDE) & (self.weight > 0.0)
+        unlike = np.linalg.norm(cv2.GaussianBlur(self.off, (0, 0), 0.7), axis=-1) > UNLIKE * self.noise
+        return float(unlike[around].mean()) if around.any() else 0.0
 
     def robust(self, rest: np.ndarray) -> np.ndarray:
         return self.weight / (1.0 + (rest**2).mean(-1) / ODD**2)
@@ -183,30 +187,33 @@ def _shaded(now: np.ndarray, still: np.ndarray, colors: np.ndarray) -> tuple[np.
 
 
 def moved(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray, by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A pose after small motions `by` [ways], each of about a pixel: across, down, towards, and about three axes."""
-    scale = axes(look, eye, place)
-    place = place + scale[:, :3] @ by[:3]
-    if look.ways == 6:
-        turn = pose.multiply(pose.from_rotvec(scale[:, 3:] @ by[3:]), turn)
-    return place, turn
+    """A pose after small motions `by` [ways], each of about a pixel."""
+    way = axes(look, eye, place, turn) @ by
+    return place + way[:3], pose.multiply(pose.from_rotvec(way[3:]), turn)
 
 
-def axes(look: Look, eye: Eye, place: np.ndarray) -> np.ndarray:
-    """[3, 6] columns: shifts in m (then rotations in rad) of the world that move the outline by about a pixel."""
+def axes(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """[6, ways] motions of the world (shift in m, rotation vector in rad) that move the outline by about a pixel:
+    across, down, towards the camera, and about axes."""
     local = eye.seen(place)
     pixel = local[2] / eye.focal
     large = max(look.radius / pixel, 1.0)
-    shift = np.stack([[pixel, 0, 0], [0, pixel, 0], local / large], 1)
-    return eye.rotation.T @ np.c_[shift, np.eye(3) / large]
+    shift = eye.rotation.T @ np.stack([[pixel, 0, 0], [0, pixel, 0], local / large], 1)
+    about = eye.rotation.T
+    if look.ways == 5:  # about two axes across its own
+        own = pose.rotate(turn, look.axis)
+        about = np.linalg.svd(own[None])[2][1:].T
+    return block_diag(shift, about[:, : look.ways - 3] / large)
 
 
 def fitted(
     look: Look, eye: Eye, frame: Frame, place: np.ndarray, turn: np.ndarray, flow: np.ndarray, spread: float,
-    color: np.ndarray | None, *, rounds: int = ROUNDS, wide: float = 0.0,
+    color: np.ndarray | None, *, rounds: int = ROUNDS, wide: float = 0.0, turned: bool = True,
     shadows: bool = True,
 ) -> Seen | None:  # fmt: skip
     """The pose near a first guess that explains a frame best; `wide`: px by which both are smeared, for a guess that
-    is off by as much; `shadows` beside the body are known by their colour. None if it is not in the picture."""
+    is off by as much; without `turned` its orientation stays, as smeared pictures hardly show it; `shadows` beside the
+    body are known by their colour. None if it is not in the picture."""
     most = SMEARED * look.radius * eye.focal / max(float(eye.seen(place)[2]), look.radius)
     flow = flow * min(1.0, most / max(float(np.hypot(*flow)), 1e-9))
     at = look.window(eye, place, turn, MARGIN + 3.0 * wide + 0.6 * float(np.abs(flow).max()))
@@ -214,22 +221,23 @@ def fitted(
         return None
     seen = Comparison(look, eye, frame, at, flow, spread, wide)
     damping = 1e-3
-    cover = seen.cover(place, turn)
+    patterns = seen.patterns(place, turn)
     if color is not None and shadows:
-        seen.shade(cover, color)
-    color_now, rest = seen.explained(cover, color, seen.weight)
+        seen.shade(patterns, color)
+    color_now, rest = seen.explained(patterns, color, seen.weight)
     weight = seen.robust(rest)
-    color_now, rest = seen.explained(cover, color, weight)
+    color_now, rest = seen.explained(patterns, color, weight)
     cost = seen.cost(rest)
     slopes = _slopes(seen, place, turn, color, weight, rest)
     for _ in range(rounds):
         _, normal, pull = slopes
         by = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-3), pull)
+        by[3:] *= turned
         by *= min(1.0, (1.5 + wide) / max(np.abs(by).max(), 1e-9))
         new = moved(look, eye, place, turn, by)
         if eye.seen(new[0])[2] < 1.5 * look.radius:
             return None
-        tried, left = seen.explained(seen.cover(*new), color, weight)
+        tried, left = seen.explained(seen.patterns(*new), color, weight)
         after = seen.cost(left)
         if after < cost:
             done = np.abs(by).max() < 0.02 or cost - after < 1e-4 * cost
@@ -253,7 +261,7 @@ def _slopes(seen: Comparison, place, turn, color, weight, rest) -> tuple[np.ndar
     for k in range(ways):
         by = np.zeros(ways)
         by[k] = TRY
-        ends = [seen.explained(seen.cover(*moved(seen.look, seen.eye, place, turn, s * by)), color, weight)[1]
+        ends = [seen.explained(seen.patterns(*moved(seen.look, seen.eye, place, turn, s * by)), color, weight)[1]
                 for s in (1.0, -1.0)]  # fmt: skip
         slope.append((ends[0] - ends[1]) / (2.0 * TRY))
     stacked = np.stack(slope)
@@ -277,23 +285,20 @@ def _seen(seen: Comparison, place, turn, color, rest, weight, slope, normal, pul
     values = np.maximum(values, 0.0)
     root = vectors * np.sqrt(values / (1.0 + values * FLOOR**2)) @ vectors.T  # per pixel-like motion
     off = np.linalg.pinv(normal, rcond=1e-6) @ pull
-    scale = axes(look, eye, place)
-    to_world = np.zeros((6, 6))
-    to_world[:3, :3], to_world[3:, 3:] = scale[:, :3], scale[:, 3:]
-    full = np.zeros((6, 6))
-    full[: look.ways, : look.ways] = root
+    full = np.zeros((6, look.ways))
+    full[: look.ways] = root
     before, small = (np.abs(seen.off) ** 2).mean(-1), (rest**2).mean(-1) * seen.noise**2
-    size = seen.cover(place, turn).sum((1, 2))
+    size = seen.sizes(seen.patterns(place, turn))
     large = size > LARGE * size.sum()
     color = color.copy()
     color[: len(size)][~large] = size[large] @ color[: len(size)][large] / max(float(size[large].sum()), 1e-6)
     counts = weight if look.support else seen.weight  # what lies on a support is not explained by it
     total = float((before * counts).sum())
     score = 1.0 - float((small * counts).sum()) / max(total, 1e-9)
-    if total < 4.0 * seen.noise**2 * seen.weight.size:
+    if total < 4.0 * seen.noise**2 * seen.weight.size or (not look.support and seen.reaches(place, turn) > HAND):
         score = min(score, 0.0)
-    return Seen(place, turn, full @ np.linalg.inv(to_world), full[:, : look.ways] @ off,
-                full[:, : look.ways] @ like, color, score, np.sqrt(mean))  # fmt: skip
+    return Seen(place, turn, full @ np.linalg.pinv(axes(look, eye, place, turn)), full @ off, full @ like, color,
+                score, np.sqrt(mean))  # fmt: skip
 
 
 def _alike(look: Look, eye: Eye, other: Eye, place, turn) -> np.ndarray:
@@ -308,6 +313,6 @@ def _alike(look: Look, eye: Eye, other: Eye, place, turn) -> np.ndarray:
         by = np.zeros(look.ways)
         by[k] = 1e-3
         new, turned = moved(look, eye, place, turn, by)
-        body = pose.rotate(pose.multiply(turned, pose.conjugate(turn)), points) if look.ways == 6 else points
+        body = pose.rotate(pose.multiply(turned, pose.conjugate(turn)), points)
         columns.append(((eye.project(body + new) - base) / 1e-3).ravel())
     return np.linalg.lstsq(np.stack(columns, 1), target.ravel(), rcond=None)[0]

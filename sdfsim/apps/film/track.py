@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import cv2
@@ -13,7 +14,7 @@ from sdfsim.apps.film.background import Background
 from sdfsim.apps.film.drawing import Look, Window
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.frames import Clip
-from sdfsim.apps.film.poses import Frame, Seen, Shutter, fitted
+from sdfsim.apps.film.poses import ROUNDS, Frame, Seen, Shutter, fitted
 from sdfsim.apps.observed import Recording
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.parallel import Progress, silent
@@ -114,7 +115,7 @@ def find(
         turns += [pose.normalise(q) for q in rng.standard_normal((TURNS, 4))]
     none, found = np.zeros(2), []
     frame = frame_of(clip, back, 0, way=-1)
-    begun = fitted(look, eye, frame, place, turn, none, 0.7, None, wide=2.5)
+    begun = fitted(look, eye, frame, place, turn, none, 0.7, None, wide=2.5, turned=False)
     begun = begun and fitted(look, eye, frame, begun.place, begun.turn, none, 0.7, None)
     if begun is not None:
         found.append((0, begun))
@@ -220,7 +221,8 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         # All predictions are tried: where pictures show depth and tilt badly, one alone leads from wrong to worse.
         if best is not None and best.score > GOOD and n >= len(likely):
             break
-        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide)
+        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide,
+                     turned=not wide)  # fmt: skip
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
         if one is not None and not _repainted(look, one, first) and odd(one, likely) < least:
@@ -299,6 +301,7 @@ def flows(clip: Clip, eye: Eye, track: Track, shutter: Shutter) -> dict[int, np.
 def again(
     clip: Clip, back: Background, eye: Eye, shutter: Shutter, track: Track,
     hidden: Sequence[np.ndarray | None] | None = None, only: Sequence[int] | None = None, shadows: bool = True,
+    rounds: int = ROUNDS,
 ) -> Track:  # fmt: skip
     """The poses fitted again, with both neighbours' speeds, the film's usual colours, and another background."""
     speed = flows(clip, eye, track, shutter)
@@ -307,7 +310,8 @@ def again(
     for k in [k for k in track.frames.tolist() if only is None or k in only]:
         frame, one = frame_of(clip, back, k, hidden[k] if hidden else None, 0), track.seen[k]
         usual = 0.5 * (color + one.color)
-        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, usual, shadows=shadows)
+        new = fitted(track.look, eye, frame, one.place, one.turn, speed[k], shutter.spread, usual, rounds=rounds,
+                     shadows=shadows)  # fmt: skip
         seen[k] = None if new is None or new.score < POOR or at_edge(track.look, eye, new.place, new.turn) else new
     return Track(track.look, seen)
 
@@ -318,8 +322,10 @@ def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
     fast = sorted(speed, key=lambda k: -float(np.hypot(*speed[k])))
     some = fast[2 : max(10, len(fast) // 4) : max(1, len(fast) // 40)][:8]
 
+    @cache
     def rest(trial: Shutter) -> float:
-        found = again(clip, back, eye, trial, track, only=some, shadows=False)  # smears are dark beside it too
+        # Smears are dark beside it, as shadows are.
+        found = again(clip, back, eye, trial, track, only=some, shadows=False, rounds=6)
         return float(np.median([one.mean**2 if (one := found.seen[k]) else 1e3 for k in some]))
 
     best = Shutter(0.5 * clip.step, SPREADS[1])

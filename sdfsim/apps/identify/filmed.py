@@ -31,6 +31,9 @@ FINE = 4  # times as many inner steps as usual: poses of films show an impact to
 ROUNDS = 10
 LAGS = 12  # frames over which errors may be alike
 ODD = 3.0  # standard deviations beyond which a pose counts less
+BRAKED = 4.0  # m/s^2, by which friction usually slows
+LYING = 1.3  # rise of the cost up to which it does
+SEATED = 10.0  # standard deviations within which a body that seems to lie on something does
 WORSE = 3.0  # how much larger the remaining differences of long windows may be than those of short ones
 SIZE = 0.1  # m, of the bodies for which windows are as long as said
 STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
@@ -135,7 +138,7 @@ class Shots:
         return np.einsum("wtdij,vwtdj->vwtdi", self.root, away) + self.rest
 
     def begun(self) -> _Starts:
-        """First guesses: parabolas through the first frames, with gravity or without, by the poses' uncertainty."""
+        """First guesses: parabolas through the first frames, by gravity or by friction, by the poses' uncertainty."""
         count = len(self.begin)
         found = _Starts(
             np.zeros((count, self.many, 3)), np.zeros((count, self.many, 4)), *np.zeros((2, count, self.many, 3))
@@ -147,27 +150,49 @@ class Shots:
                 time = self.dt * rows + self.late[w, rows]
                 best = None
                 for some in (rows, rows[:4]):
-                    for pull in (g, 0.0 * g):
-                        t = time[: len(some)]
+                    for pull, braked in ((g, 1e-6), (0.0 * g, BRAKED)):
+                        t = time[: len(some), None, None]
                         root, rest = self.root[w, some, d][:, :, :3], self.rest[w, some, d]
-                        level = self.place[w, some, d] - 0.5 * t[:, None] ** 2 * pull
-                        matrix = np.concatenate([root, root * t[:, None, None]], 2).reshape(-1, 6)
+                        level = self.place[w, some, d] - 0.5 * t[:, 0] ** 2 * pull
+                        matrix = np.concatenate([root, root * t, 0.5 * root * t**2], 2).reshape(-1, 9)
                         right = (np.einsum("tij,tj->ti", root, level) - rest).ravel()
-                        weak = 1e-3 * np.linalg.norm(matrix) * np.eye(6)
-                        guess = np.linalg.lstsq(np.r_[matrix, weak * 1e-3], np.r_[right, np.zeros(6)], rcond=None)[0]
+                        weak = np.diag(np.r_[np.full(6, 1e-6 * np.linalg.norm(matrix)), np.full(3, 1.0 / braked)])
+                        guess = np.linalg.lstsq(np.r_[matrix, weak], np.r_[right, np.zeros(9)], rcond=None)[0]
                         chi = float(np.square(matrix @ guess - right).sum()) / len(some)
                         if best is None or chi < 0.5 * best[0]:
                             best = chi, guess
                 assert best is not None
-                found.position[w, d], found.velocity[w, d] = best[1][:3], best[1][3:]
-                found.orientation[w, d] = self.turn[w, rows[0], d]
-                if self.root[w, rows[0], d, 3:, 3:].any():
-                    spin = pose.to_rotvec(
-                        pose.multiply(self.turn[w, rows[1:4], d], pose.conjugate(self.turn[w, rows[:1], d]))
-                    )
-                    t = (time[1:4] - time[0])[:, None]
-                    found.spin[w, d] = (spin * t).sum(0) / (t**2).sum()
+                found.position[w, d], found.velocity[w, d] = best[1][:3], best[1][3:6]
+                some, t = rows[:4], (time - time[0])[:4]
+                first = self.turn[w, rows[0], d]
+                way = pose.to_rotvec(pose.multiply(self.turn[w, some, d], pose.conjugate(first)))
+                root = self.root[w, some, d][:, :, 3:]  # nothing, about the axis of what is round
+                matrix = np.concatenate([root, root * t[:, None, None]], 2).reshape(-1, 6)
+                right = (np.einsum("tij,tj->ti", root, way) - self.rest[w, some, d]).ravel()
+                guess = np.linalg.lstsq(matrix, right, rcond=0.01)[0]
+                found.orientation[w, d] = pose.multiply(pose.from_rotvec(guess[:3]), first)
+                found.spin[w, d] = guess[3:]
         return found
+
+    def seated(self, starts: _Starts, values: np.ndarray) -> list[_Starts]:
+        """The starts, and others in which bodies that seem to lie on something do: in the pose in which they come to
+        rest if they begin at rest, as long as what was seen is not far from it. They move as before, or level."""
+        place, turn = self.run(replace(starts, velocity=0.0 * starts.velocity, spin=0.0 * starts.spin), values)
+        place, turn = place[:, -1], turn[:, -1]
+        rotated = pose.to_rotvec(pose.multiply(turn, pose.conjugate(starts.orientation)))
+        away = np.concatenate([place - starts.position, rotated], -1)
+        off = np.einsum("wdij,wdj->wdi", self.root[:, 0], away)
+        near = np.square(off).mean(-1, keepdims=True) < SEATED**2
+        lying = replace(
+            starts,
+            position=np.where(near, place, starts.position),
+            orientation=np.where(near, turn, starts.orientation),
+            spin=np.where(near, 0.0, starts.spin),
+        )
+        gravity = np.asarray(self.problem.scene.gravity)
+        up = gravity / max(float(np.linalg.norm(gravity)), 1e-9)
+        level = starts.velocity - near * (starts.velocity @ up)[..., None] * up
+        return [starts, lying, replace(lying, velocity=level)]
 
     def priors(self, starts: _Starts) -> tuple[np.ndarray, np.ndarray]:
         """Rows [W, D * 12] that keep what nothing shows, and their slopes [D * 12]: spins are about zero."""
@@ -219,6 +244,14 @@ class Fitting:
         )
         mean = float(np.sqrt(np.median(square[seen])))
         return off, 1.0 / np.sqrt(1.0 + square / ODD**2), cost, mean
+
+    def first(self, fit: _Fit) -> _Fit:
+        """The fit, in which what seems to lie on something does, unless that explains much less."""
+        found, *lying = [replace(fit, starts=one) for one in self.shots.seated(fit.starts, fit.values)]
+        for one in (found, *lying):
+            *_, one.cost, one.mean = self.errors(one)
+        best = min(lying, key=lambda one: one.cost)
+        return best if best.cost < LYING * found.cost else found
 
     def slopes(self, fit: _Fit, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives [W, R, D * 12] by the starts, in `scale`, and [W, R, P + K] by parameters and camera."""
@@ -317,12 +350,26 @@ def first_frames(r: Recording, length: int) -> list[int]:
 
 @dataclass(frozen=True)
 class Filmed:
-    """What films show."""
+    """A fit of films."""
 
-    found: Identified
-    shots: Shots
+    fitting: Fitting
     fit: _Fit  # its `camera` [C]: how the cameras of all films were changed, in standard deviations
     values: list[dict[tuple[str, str], float]]  # of parameters, by kind and name, with each of the cameras so far
+
+    def shown(self) -> Identified:
+        """Values with their intervals."""
+        return _reported(self.fitting, self.fit, self.values)
+
+    def motion(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+        """(recording, row) -> the fit's centres of mass [D, 3] and orientations [D, 4]; of windows that overlap, the
+        one that began first."""
+        shots = self.fitting.shots
+        place, turn = shots.run(self.fit.starts, self.fit.values)
+        found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
+        for w, (k, t) in enumerate(shots.begin):
+            for row in range(min(shots.length + 1, len(shots.problem.recordings[k].known) - t)):
+                found.setdefault((k, t + row), (place[w, row], turn[w, row]))
+        return found
 
 
 def identify_films(
@@ -338,8 +385,9 @@ def identify_films(
     if near is None:
         fitting, best = _from_nothing(problem, on_progress)
     else:
-        shots = Shots(problem, near.shots.begin, near.shots.length)
-        shift = shots.place[:, 0] - near.shots.place[:, 0]
+        before = near.fitting.shots
+        shots = Shots(problem, before.begin, before.length)
+        shift = shots.place[:, 0] - before.place[:, 0]
         starts = replace(near.fit.starts, position=near.fit.starts.position + shift)
         problem.choose(_touched(problem, shots, starts))
         known = zip(problem.parameters, problem.start, strict=True)
@@ -349,7 +397,7 @@ def identify_films(
         best = fitting.solved(best, ROUNDS, on_progress, "another camera")
     now = {(p.kind, p.name): float(v) for p, v in zip(problem.parameters, best.values, strict=True)}
     every = [*(near.values if near else []), now]
-    return Filmed(reported(problem, fitting, best, every), fitting.shots, best, every)
+    return Filmed(fitting, best, every)
 
 
 def _from_nothing(problem: Problem, on_progress: Progress) -> tuple[Fitting, _Fit]:
@@ -368,8 +416,7 @@ def _from_nothing(problem: Problem, on_progress: Progress) -> tuple[Fitting, _Fi
     starts = shots.begun()
     problem.choose(_touched(problem, shots, starts))
     fitting, low, high = Fitting(shots), *problem.bounds
-    best = _Fit(problem.start.copy(), np.zeros(shots.camera.shape[-1]), starts)
-    *_, best.cost, best.mean = fitting.errors(best)
+    best = fitting.first(_Fit(problem.start.copy(), np.zeros(shots.camera.shape[-1]), starts))
     tries = [best]
     for f, e in TRIED:  # a few rounds each: starts are known too badly to tell before they are fitted
         alike = [{"friction": f, "restitution": e}.get(p.kind, p.start) for p in problem.parameters]
@@ -387,7 +434,8 @@ def _from_nothing(problem: Problem, on_progress: Progress) -> tuple[Fitting, _Fi
             for name in vars(guess) if alike else ():
                 getattr(guess, name)[w] = getattr(best.starts, name)[row]
         final = Fitting(longer)
-        last = final.solved(_Fit(best.values.copy(), best.camera.copy(), guess), ROUNDS, on_progress, "long windows")
+        last = final.first(replace(best, starts=guess))
+        last = final.solved(last, ROUNDS, on_progress, "long windows")
         if last.mean < WORSE * best.mean:
             fitting, best = final, last
     return fitting, best
@@ -421,11 +469,10 @@ def persistence(shots: Shots, off: np.ndarray) -> float:
     return 1.0 + 2.0 * max(0.0, float(share @ alike[1:]) / max(alike[0], 1e-9))
 
 
-def reported(
-    problem: Problem, fitting: Fitting, fit: _Fit, every: Sequence[dict[tuple[str, str], float]]
-) -> Identified:
+def _reported(fitting: Fitting, fit: _Fit, every: Sequence[dict[tuple[str, str], float]]) -> Identified:
     """Values with intervals: starts and camera are fitted again for each value of a parameter. `every`: what was found
     with other cameras."""
+    problem = fitting.problem
     off, weight, _, _ = fitting.errors(fit)
     own, shared = fitting.slopes(fit, off)
     rest, own, shared = fitting.blocks(fit, off, weight, own, shared)
@@ -491,14 +538,3 @@ def _worst(shots: Shots, off: np.ndarray) -> list[str]:
         time, name = shots.dt * (first + t) + shots.late[w, t], shots.problem.moving[d].name
         found.append(f"{name} at {time:.2f} s by {off[w, t, d]:.1f}")
     return ["worst frames, standard deviations: " + ", ".join(dict.fromkeys(found))]
-
-
-def motion_of(shots: Shots, fit: _Fit) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
-    """(recording, row) -> the fit's centres of mass [D, 3] and orientations [D, 4]; of windows that overlap, the one
-    that began first."""
-    place, turn = shots.run(fit.starts, fit.values)
-    found: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]] = {}
-    for w, (k, t) in enumerate(shots.begin):
-        for row in range(min(shots.length + 1, len(shots.problem.recordings[k].known) - t)):
-            found.setdefault((k, t + row), (place[w, row], turn[w, row]))
-    return found
