@@ -622,23 +622,6 @@ def test_a_solid_without_pieces_is_cut_once_by_coacd(tmp_path, monkeypatch, capl
     assert np.isfinite(corners).all() and model.ngeom == len(report["files"]) - 1
 
 
-def test_a_shape_becomes_one_urdf(tmp_path):
-    import pybullet as engine
-
-    report = export(SHAPES / "cone", tmp_path / "cone.urdf")
-    assert [path.name for path in report["files"]] == ["cone.urdf", "cone.obj", "cone-0.obj"]
-    shape = load_shape(SHAPES / "cone")
-    engine.connect(engine.DIRECT)
-    try:
-        body = engine.loadURDF(str(tmp_path / "cone.urdf"), flags=engine.URDF_USE_INERTIA_FROM_FILE)
-        assert engine.getDynamicsInfo(body, -1)[0] == pytest.approx(1000 * shape.volume)
-        np.testing.assert_allclose(engine.getBasePositionAndOrientation(body)[0], shape.com, atol=1e-9)
-        low, high = engine.getAABB(body)
-        np.testing.assert_allclose([low, high], shape.sdf.bounds, atol=0.005)
-    finally:
-        engine.disconnect()
-
-
 # --- poses ---
 
 
@@ -789,26 +772,6 @@ def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> No
         to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
         points = np.array(prim.GetPointsAttr().Get(), dtype=float) @ to_world[:3, :3] + to_world[3, :3] - FAR
         np.testing.assert_allclose([points.min(0), points.max(0)], box, atol=1e-4)
-
-
-def test_a_part_of_a_third_of_a_millimetre_loads_in_mujoco_and_falls(tmp_path: Path) -> None:
-    import mujoco
-
-    size, (low, high) = 3.6e-4, (0.0, 1.2e-3)
-    mesh_shape(primitives.box((size,) * 3), name="speck", kind="mesh").save(tmp_path / "speck")
-    scene = SceneBuilder().add("floor", plane={"offset": low})
-    scene.add("speck", asset=tmp_path / "speck", position=(0, 0, high), density=1000)
-    report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "scene.xml")
-    (line,) = (line for line in report["left_out"] if "MuJoCo refuses" in line)
-    assert "speck" in line and "mm" in line and "1e-9 kg" in line
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    assert model.body("speck").mass[0] * 1e-9 == pytest.approx(1000 * size**3, rel=1e-6)
-    mujoco.mj_step(model, data, 10)
-    assert (1000 * high - data.body("speck").xpos[2]) / 1000 == pytest.approx(9.81 * 0.01**2 / 2, rel=0.12)
-    mujoco.mj_step(model, data, 500)
-    assert data.body("speck").xpos[2] / 1000 == pytest.approx(size / 2, rel=0.05)
 
 
 def test_cones_and_rings_are_meshes_for_engines(tmp_path: Path) -> None:

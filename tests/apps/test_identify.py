@@ -22,7 +22,6 @@ from sdfsim.apps.identify.optimiser import identify
 from sdfsim.apps.identify.report import picture, report_lines, write_scene
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
 from sdfsim.simulate.simulator import Simulator, run_all
@@ -300,64 +299,6 @@ def test_a_start_is_fitted_through_the_flight(tmp_path):
 
 
 # --- another engine ---
-
-
-def pybullet_tosses(folder: Path, tilt: float = 0.02, count: int = 16) -> Path:
-    """A box tossed onto ground at z = 0.5 that is tilted about y, by PyBullet in steps of a millisecond."""
-    engine = import_pybullet()
-    rng, arrays, start = np.random.default_rng(4), {"position": [], "quat_xyzw": []}, [0]
-    turn = Rotation.from_euler("y", tilt)
-    for _ in range(count):
-        client = engine.connect(engine.DIRECT)
-        engine.setGravity(0, 0, -9.81)
-        engine.setTimeStep(1e-3)
-        plane = engine.createMultiBody(
-            0.0,
-            engine.createCollisionShape(engine.GEOM_PLANE),
-            basePosition=[0, 0, 0.5],
-            baseOrientation=turn.as_quat(),
-        )
-        engine.changeDynamics(plane, -1, lateralFriction=1.0, restitution=1.0)
-        shape = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[0.05, 0.04, 0.03])
-        quat = Rotation.random(rng=rng).as_quat()
-        box = engine.createMultiBody(0.5, shape, basePosition=[0, 0, 0.72], baseOrientation=quat)
-        engine.changeDynamics(box, -1, lateralFriction=0.25, restitution=0.0, linearDamping=0, angularDamping=0)
-        velocity = [*rng.uniform(-1, 1, 2), 0.5]
-        engine.resetBaseVelocity(box, velocity, rng.normal(0, 4, 3).tolist())
-        for _ in range(120):
-            place, quat = engine.getBasePositionAndOrientation(box)
-            arrays["position"].append(place)
-            arrays["quat_xyzw"].append(quat)
-            for _ in range(8):
-                engine.stepSimulation()
-        start.append(len(arrays["position"]))
-        engine.disconnect(client)
-    place = np.array(arrays["position"]) + 1e-4 * rng.standard_normal((start[-1], 3))
-    np.savez(folder / "tosses.npz", dt=0.008, start=start, position=place, quat_xyzw=arrays["quat_xyzw"])
-    bodies = [
-        {"name": "ground", "plane": {"offset": 0.497}, "friction": 1.0, "restitution": 1.0},
-        {"name": "box", "shape": "box", "position": [0, 0, 1], "mass": 0.5},
-    ]
-    return write_scene_file(folder / "scene.yaml", {"box": {"box": {"size": [0.1, 0.08, 0.06]}}}, bodies)
-
-
-@pytest.mark.slow
-def test_tosses_of_another_engine_show_friction_and_ground_that_is_tilted(tmp_path):
-    scene = pybullet_tosses(tmp_path)
-    out = tmp_path / "identified.yaml"
-    done = CliRunner().invoke(
-        cli.app, ["identify", str(tmp_path / "tosses.npz"), "--scene", str(scene), "-o", str(out), "--json"]
-    )
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
-    assert found["friction"]["box / ground"]["value"] == pytest.approx(0.25, abs=0.04)
-    assert found["tilt"]["ground about y"]["value"] == pytest.approx(np.degrees(0.02), abs=0.25)
-    assert found["tilt"]["ground about x"]["value"] == pytest.approx(0.0, abs=0.25)
-    assert found["held_out"]["recordings"] == 2
-    assert found["held_out"]["after"][0] < 0.6 * found["held_out"]["before"][0]
-    ground = load_scene(out).bodies[0]
-    normal = Rotation.from_quat(ground.quat_xyzw).apply([0, 0, 1])
-    assert ground.position @ normal / normal[2] == pytest.approx(0.5, abs=0.002)
 
 
 # --- the scene that is written ---

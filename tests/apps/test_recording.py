@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -21,11 +20,11 @@ from sdfsim.apps.recording import (
     save_rollout,
 )
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.geometry.primitives import box, sphere
+from sdfsim.geometry.primitives import box
 from sdfsim.physics.rollout import Rollout
 from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.camera import Camera
-from sdfsim.simulate.looks import FARTHEST, framed, shown, with_normals
+from sdfsim.simulate.looks import FARTHEST, framed, shown
 from tests.helpers.runs import read
 
 STEPS = 6
@@ -151,15 +150,6 @@ def test_nodes_contacts_and_forces_are_hidden_until_switched_on(scene, tmp_path,
     assert told.count("EntityBehavior:visible") >= 5
 
 
-def test_a_plot_with_nothing_to_show_is_not_there(scene, tmp_path, rollout):
-    for empty, kept in (((), ("network", "milliseconds")), (("nodes", "edges"), ("milliseconds", "contacts"))):
-        nothing = {key: np.zeros(STEPS + 1) for key in empty}
-        save_rollout(scene, replace(rollout, counters=rollout.counters | nothing), tmp_path / "rollout.rrd")
-        told = blueprint(tmp_path / "rollout.rrd")
-        views = re.findall(r"\[TimeSeries\] .*?\[(.+?)\]", told)
-        assert set(kept) <= set(views) and ("network" in views) == (not empty)
-
-
 def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_path):
     """A ball (2 m across) falls, while a brick (3 m) of whatever mass stands; then the brick is hit with ten times its
     weight, and later moves evenly aside while it is held up."""
@@ -242,19 +232,6 @@ def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_o
     assert found["/world/cameras/next1!"]["Pinhole:color"][0][0] == 0xFF28C8FF
     assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 36
     assert "/world/surface!" in found
-
-
-def test_boxes_keep_their_edges_and_balls_stay_smooth():
-    mesh, normals = with_normals(box())
-    assert len(mesh.vertices) == 36
-    np.testing.assert_allclose(np.abs(normals).max(1), 1.0)
-    mesh, normals = with_normals(sphere())
-    np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-3)
-    colored = box()
-    colored = Mesh(colored.vertices, colored.faces, np.arange(24, dtype=np.uint8).reshape(8, 3))
-    mesh, _ = with_normals(colored)
-    assert mesh.colors is not None and colored.colors is not None
-    np.testing.assert_array_equal(mesh.colors[mesh.faces], colored.colors[colored.faces])
 
 
 def crowd(tmp_path, count: int, frames: int, name: str = "ball"):

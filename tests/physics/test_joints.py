@@ -42,14 +42,6 @@ def test_a_hinge_starts_at_the_angle_that_is_given(limits, start):
         simulator.step(20)
 
 
-def test_jointed_bodies_with_nothing_to_touch_swing():
-    free, alone = rod({}), rod({}, collides_with=[])
-    free.step(50)
-    alone.step(50)
-    assert alone.joint("pin").angle == pytest.approx(free.joint("pin").angle, abs=1e-12)
-    assert alone.contact_points() == []
-
-
 def test_a_gripper_that_lifts_makes_no_energy():
     """Targets change in each step while contacts hold: what the solve knows of impulses stays valid."""
     built = scene()
@@ -148,14 +140,6 @@ def test_steps_in_one_call_and_one_by_one_are_the_same_bits():
         single.step()
     assert same(at_once.state, single.state)
     assert frames[0].joint_position.shape == (60, 2)
-
-
-def test_variants_of_a_scene_in_one_call_move_as_each_by_itself():
-    simulator = Simulator(tumbling())
-    variant = {"box1": {"velocity": (0.3, 0.0, 1.0)}}
-    many = simulator.rollouts([{}, variant], steps=40)
-    assert np.array_equal(many[0].position, Simulator(tumbling()).run(steps=40).position)
-    assert not np.array_equal(many[0].position, many[1].position)
 
 
 def test_joints_that_are_off_leave_a_scene_as_it_is_without_them():

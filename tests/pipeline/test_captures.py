@@ -130,15 +130,6 @@ def plane_at(tmp_path: Path, away: float) -> tuple[list[View], list[Photo]]:
     return [camera("a", 0.0), camera("b", 0.3)], [photo("a"), photo("b")]
 
 
-def test_pixels_with_depth_become_points_on_what_they_show(tmp_path):
-    views, photos = plane_at(tmp_path, 2.0)
-    points = depth_points(views, photos, tmp_path, scale=1.5)
-    np.testing.assert_allclose(points.xyz[:, 2], 3.0, rtol=1e-6)
-    for number, view in enumerate(views):
-        mine = points.view == number
-        np.testing.assert_allclose(view.project(points.xyz[mine])[0], points.pixel[mine], atol=1e-6)
-
-
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
 def test_the_scale_of_depth_is_found_from_triangulated_points(factor, tmp_path):
     views, photos = plane_at(tmp_path, 2.0)

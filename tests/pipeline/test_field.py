@@ -16,12 +16,11 @@ from pipeline.field.grid_field import (
     Bricks,
     FieldSize,
     GridField,
-    contract,
     differences,
     sample_weights,
     stencil,
 )
-from pipeline.field.rendering import choose_samples, sdf_cache, sphere_interval
+from pipeline.field.rendering import choose_samples
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import (
     BACKGROUND_RATE,
@@ -70,32 +69,11 @@ def test_a_ray_that_starts_inside_sees_its_first_sample():
     assert weights[0, 0].item() == pytest.approx(1.0, abs=1e-6) and left.item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_sphere_interval_closed_form():
-    origin = torch.tensor([[0.0, 0, -3], [0, 0, 0], [5, 5, -3]])
-    direction = torch.tensor([[0.0, 0, 1]] * 3)
-    enter, leave = sphere_interval(origin, direction)
-    assert enter.tolist()[:2] == pytest.approx([2, 0.02]) and leave.tolist()[:2] == pytest.approx([4, 1])
-    assert enter[2] == leave[2]
-
-
-def test_contraction_keeps_the_sphere_and_maps_infinity_to_one():
-    p = torch.tensor([[0.0, 0, 1], [0, 0, 2], [0, 0, 1e9]])
-    assert contract(p)[:, 2].tolist() == pytest.approx([0.5, 0.75, 1.0])
-
-
 def test_differences_on_a_quadratic():
     p = torch.randn(20, 3, dtype=torch.float64)
     values = (stencil(p, 0.01) ** 2).sum(-1)
     gradient, laplacian = differences(values, 0.01)
     assert torch.allclose(gradient, 2 * p) and torch.allclose(laplacian, torch.full_like(laplacian, 6.0), atol=1e-8)
-
-
-def test_fresh_field_is_a_ball():
-    field = GridField(FieldSize(), seed=0, start_radius=0.3)
-    p = torch.randn(500, 3)
-    p = p / p.norm(dim=1, keepdim=True) * torch.rand(500, 1)
-    with torch.no_grad():
-        assert (field.sdf(p) - (p.norm(dim=1) - 0.3)).abs().max() < 0.15
 
 
 def test_samples_gather_at_the_surface():
@@ -145,17 +123,6 @@ def test_a_checkpoint_that_cannot_be_read_is_reported_and_leaves_nothing_behind(
     run.step()
     for a, b in zip(untouched.field.parameters(), run.field.parameters(), strict=True):
         assert torch.equal(a, b)
-
-
-def test_no_checkpoint_is_no_fault(tmp_path):
-    assert not trainer().load(tmp_path / "none")
-
-
-def test_training_lowers_the_colour_error():
-    run = trainer()
-    losses = [run.step()["color"] for _ in range(20)]
-    assert np.mean(losses[-4:]) < np.mean(losses[:4])
-    assert torch.isfinite(sdf_cache(run.field, 2 / 8)).all()
 
 
 def test_masks_make_what_they_exclude_transparent():

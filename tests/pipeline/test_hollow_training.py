@@ -107,10 +107,3 @@ def test_walls_are_as_thick_as_they_are(made):
     """Halfway down, where photos see both sides."""
     found, wanted = (thickness(one, made.of) for one in (made.distance, made.of.distance))
     assert np.median(np.abs(found / wanted - 1)) < 0.3
-
-
-def test_bricks_are_where_the_surface_is(made):
-    """They go along the ground and the body, and leave most of the space out."""
-    level = made.found.field.bricks[0]
-    share = len(level.places) / (-(-level.side // 4)) ** 3
-    assert 0.01 < share < 0.3 and level.values.abs().max() > 0

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.cameras import PosedPhotos
 from pipeline.mesh import bodies
-from pipeline.mesh.bodies import Parts, find_level_planes, split
+from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.seams import Part
 from sdfsim.geometry.bvh import Winding
@@ -205,9 +205,3 @@ def test_a_body_that_two_photos_see_is_none():
     alone = replace(alone, views=np.where(alone.raw.vertices[:, 0] > 0.1, 2, alone.views))
     (left,) = split(alone, pair, FINEST, NOTHING, Path(), up, alone=True).bodies.values()
     assert signed_volume(left) == pytest.approx(0.6 * 0.4 * 0.4, rel=0.05)
-
-
-def test_level_planes_are_found_at_their_heights():
-    levels = find_level_planes(surface_of(both).visible, np.array([0.0, 0, 1]), FINEST)
-    np.testing.assert_allclose([level.height for level in levels], [-0.5, TOP], atol=0.1 * FINEST)
-    assert levels[1].area == pytest.approx(4 * TABLE[0] * TABLE[1] - np.pi * 0.12**2, rel=0.08)

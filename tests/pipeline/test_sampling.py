@@ -9,7 +9,7 @@ import torch
 
 from pipeline.cameras import PosedPhotos, Sparse
 from pipeline.field.grid_field import FieldSize, GridField
-from pipeline.field.rendering import draw, sdf_cache
+from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import (
     CLEARANCE,
     FILLED,
@@ -28,13 +28,6 @@ from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
 CELL = 2 / 127  # of the preset quick
-
-
-def test_draws_follow_their_density():
-    distance = torch.tensor([[0.0, 1.0, 2.0, 4.0]])
-    drawn = draw(distance, torch.tensor([[1.0, 0.0, 3.0]]), torch.full((1, 4000), 0.5))
-    counts = torch.histogram(drawn[0], torch.tensor([0.0, 1.0, 2.0, 4.0])).hist
-    assert counts.tolist() == pytest.approx([1000, 0, 3000], abs=5)
 
 
 def ball_cache(radius: float, n: int = 65) -> torch.Tensor:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import sdfsim
 from pipeline.cameras import Similarity
 from pipeline.clearing import Cleared
 from pipeline.mesh.bodies import Parts
@@ -50,11 +49,6 @@ def test_what_makes_no_sense_is_one_line(two, tmp_path, given, said):
     run = command("reconstruct", *words, "-o", tmp_path / "out")
     assert run.exit_code in (1, EXIT_USAGE) and said in run.stderr
     assert len([line for line in run.stderr.splitlines() if line.startswith("error:")]) == 1
-
-
-def test_a_function_that_gets_one_state_twice_says_so(two, tmp_path):
-    with pytest.raises(SdfsimError, match="is the folder of the first state as well"):
-        sdfsim.reconstruct(two[0], tmp_path / "out", joint=two[0])
 
 
 def test_masks_are_refused(two, tmp_path):

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pipeline.cameras import PosedPhotos, View
 from pipeline.grids.interpolation import places_of
-from pipeline.stereo.depth import BEYOND, DepthMap, neighbours, only, outside_mask, stereo, stereo_summary
+from pipeline.stereo.depth import BEYOND, DepthMap, outside_mask, stereo, stereo_summary
 from pipeline.stereo.fusion import Fused, fuse
 from tests.helpers.balls import BALL, Distance, ball_on_plane, camera, cup, grey_of, ring, shoot, true_depth
 
@@ -61,13 +61,6 @@ def test_depth_in_a_narrow_mouth_is_that_of_what_lies_in_it(tmp_path, monkeypatc
         inside += deep.sum()
         right += (deep & (np.abs(along / np.where(one.inverse > 0, one.inverse, 1e9) / true - 1) < 0.01)).sum()
     assert inside > 5000 and right / inside > 0.38
-
-
-def test_a_photo_is_compared_with_those_beside_it(scene):
-    poses, _ = scene
-    for number, chosen in enumerate(neighbours(poses)):
-        turn = [poses.views[k].rotation[2] @ poses.views[number].rotation[2] for k in chosen[:4]]
-        assert number not in chosen and np.degrees(np.arccos(min(turn))) < 50
 
 
 def test_the_report_says_how_much_was_seen_and_how_exactly(scene):
@@ -252,14 +245,6 @@ def test_what_masks_leave_out_is_empty(scene, tmp_path):
     far = np.hypot(row - 75, column - 100) > 45
     assert (one.inverse[far] == np.float32(BEYOND)).all() and (one.certain[far] == 1).all()
     np.testing.assert_array_equal(one.inverse[disc], maps[0].inverse[disc])
-
-
-def test_some_photos_keep_what_they_observe(scene):
-    poses, _ = scene
-    some = only(poses, [3, 7])
-    assert [view.name for view in some.views] == [poses.views[3].name, poses.views[7].name]
-    seen = poses.sparse.point_of[poses.sparse.view_of == 7]
-    np.testing.assert_array_equal(some.sparse.point_of[some.sparse.view_of == 1], seen)
 
 
 def test_two_photos_are_too_few(tmp_path):

@@ -19,7 +19,6 @@ from pipeline.mesh.placement import Scale, find_up, load_placement, place, plane
 from pipeline.mesh.visibility import Visibility
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
-from tests.helpers.sparse import sparse_of
 from tests.helpers.surfaces import cube, look_at, ring, scenery
 
 
@@ -46,17 +45,6 @@ def test_sparse_sampling_equals_dense_near_the_surface():
     close = np.abs(dense) < 0.08
     np.testing.assert_allclose(volume.values[close], dense[close], atol=1e-6)
     assert ((volume.values < 0) == (dense < 0)).all()
-
-
-def test_a_volume_knows_its_places():
-    direction = np.array([0.6, 0.0, 0.8])
-    volume = sample_box(lambda p: p @ direction - 0.2, np.array([-1.0, 0, 2]), np.array([0.0, 1, 3]), 0.25)
-    np.testing.assert_allclose(volume.along(direction), volume.points() @ direction)
-    np.testing.assert_allclose(volume.values, volume.along(direction) - 0.2, atol=1e-6)
-    at = np.random.default_rng(0).uniform([-1, 0, 2], [0, 1, 3], (50, 3))
-    np.testing.assert_allclose(volume.at(at), at @ direction - 0.2, atol=1e-6)
-    cut = volume.limited(lambda p: p[:, 2] - 2.4)
-    np.testing.assert_allclose(cut.values, np.maximum(volume.values, volume.points()[..., 2] - 2.4), atol=1e-6)
 
 
 def crowd() -> tuple[Mesh, np.ndarray]:
@@ -183,20 +171,6 @@ def test_a_floor_that_the_cameras_contradict_is_not_trusted():
 def test_bodies_without_scenery_stand_on_the_floor():
     found = place(cube(1.0), ring(), size=2.0, alone=True)
     assert found.mesh(cube(1.0)).vertices[:, 2].min() == pytest.approx(0.0, abs=1e-9)
-
-
-def test_cameras_and_points_move_together_and_know_from_where():
-    rng = np.random.default_rng(0)
-    q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    first = Similarity(2.5, q * np.sign(np.linalg.det(q)), rng.normal(size=3))
-    second = Similarity(0.3, np.eye(3)[[1, 2, 0]], rng.normal(size=3))
-    before = PosedPhotos(tuple(ring()), sparse_of(0.3 * rng.normal(size=(20, 3))))
-    after = before.moved(first).moved(second)
-    for one, other in zip(before.views, after.views, strict=True):
-        np.testing.assert_allclose(one.project(before.sparse.xyz)[0], other.project(after.sparse.xyz)[0], atol=1e-8)
-    np.testing.assert_allclose(after.moved_by.points(before.sparse.xyz), after.sparse.xyz)
-    back = after.moved_by.inverse().points(after.views[3].center)
-    np.testing.assert_allclose(back, before.views[3].center, atol=1e-12)
 
 
 def test_all_that_photos_see_of_the_solid_is_shown_but_no_cut_and_no_back():

@@ -5,19 +5,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from pipeline.cameras import View
 from pipeline.inputs.photos import Photo
 from pipeline.mesh import texture
-from pipeline.mesh.extraction import components
-from pipeline.mesh.texture import BLOCK, Shots, rasterise, shots_of, textured, unfold
+from pipeline.mesh.texture import Shots, shots_of, textured, unfold
 from pipeline.mesh.visibility import Visibility, bilinear, look, to_bytes
 from pipeline.scene_writer import skins_of
 from sdfsim.apps.recording import Playback, save_reconstruction
 from sdfsim.geometry.bvh import Caster
-from sdfsim.geometry.mesh import Mesh, joined, sample_surface, vertex_normals
+from sdfsim.geometry.mesh import Mesh, joined, sample_surface
 from sdfsim.geometry.mesh_io import read_glb, write_glb, write_ply
 from sdfsim.scene.scene import Body, Scene
 from sdfsim.shape.make import analytic_shape
@@ -179,25 +177,6 @@ def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path, monkeypat
     best = on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
     monkeypatch.setattr(texture, "POWER", 1.0)
     assert best > 1.2 * on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
-
-
-def test_charts_have_blocks_of_their_own():
-    mesh = cube(0.3, (0.0, 0.0, 0.0))
-    flat, origin, (rows, columns) = unfold(mesh, 200.0)
-    assert flat.uv is not None and rows % BLOCK == columns % BLOCK == 0
-    assert np.array_equal(flat.vertices, mesh.vertices[origin])
-    assert flat.uv.min() >= 0 and flat.uv.max() <= 1
-    corners = flat.uv[flat.faces] * [columns, rows]
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
-    assert area == pytest.approx(6 * 0.3**2 * 200**2, rel=0.12)  # charts grow to whole blocks
-    texels = rasterise(flat, vertex_normals(mesh)[origin], (rows, columns))
-    assert len(texels.at) == pytest.approx(area, rel=0.02)  # nothing lies twice
-    used = []
-    for chart in range((label := components(flat)).max() + 1):
-        own = rasterise(replace(flat, faces=flat.faces[label == chart]), vertex_normals(mesh)[origin], (rows, columns))
-        used.append(np.unique(own.at // columns // BLOCK * columns + own.at % columns // BLOCK))
-    assert len(used) >= 3 and len(np.concatenate(used)) == len(np.unique(np.concatenate(used)))
 
 
 def test_recordings_show_the_texture(tmp_path):

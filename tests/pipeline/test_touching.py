@@ -250,13 +250,6 @@ def books() -> Scene:
     return Scene(photo_sets.touching, BOOKS, 0.4, 129)
 
 
-def test_books_in_a_stack_come_apart_by_their_masks(books, tmp_path):
-    found = books.split(tmp_path / "p", BOOKS)
-    assert set(found.bodies) == set(BOOKS)
-    assert found.touching == [("book1", "book2", "masks"), ("book2", "book3", "masks")]
-    books.check(found, {name: name for name in BOOKS}, 1.2 * CELL, 0.02)
-
-
 def test_books_in_a_stack_come_apart_where_photos_show_borders_between_clicked_places(books, tmp_path):
     found = books.split(tmp_path / "p", clicked={name: [books.click(name)] for name in BOOKS})
     assert set(found.bodies) == set(BOOKS) and found.missing == []
