@@ -142,20 +142,3 @@ def test_elbows_of_the_first_session_are_turned_onto_the_table():
     up = Rotation.from_quat(found.quat_xyzw[0]).as_matrix()[:, 2, 2]
     assert up[0] == pytest.approx(1.0, abs=1e-6) and lowest(found).min() == pytest.approx(0.0, abs=1e-12)
     assert upright(seen, TILTED) is seen
-
-
-def test_the_first_session_of_the_elbow_lies_as_it_is_told(data_dir):
-    """Faces on which links came to rest are level then, in both sessions."""
-    file = np.load(data_dir / "tosses" / "elbow.npz")
-    normals: list[list[np.ndarray]] = [[], []]
-    for number, a, b in zip(file["number"], file["start"][:-1], file["start"][1:], strict=True):
-        place, turn, angle = (file[n][a:b].astype(float) for n in ("position", "quat_xyzw", "hinge"))
-        links = upright(links_of(place, Rotation.from_quat(turn), angle), int(number))
-        if np.linalg.norm(np.diff(links.position[-10:], axis=0), axis=-1).max() < 2e-4:
-            for axes in Rotation.from_quat(links.quat_xyzw[-1]).as_matrix():
-                most = np.abs(axes[2]).argmax()
-                if abs(axes[2, most]) > np.cos(np.radians(6.0)):
-                    normals[int(number >= TILTED)].append(axes[:, most] * np.sign(axes[2, most]))
-    for some in normals:
-        assert len(some) > 80
-        assert np.degrees(np.abs(np.median(some, axis=0)[:2])).max() < 0.2

@@ -9,7 +9,7 @@ pytest.importorskip("pybullet")
 
 from benchmarks.engines import bullet, drake, mujoco, newton, rapier
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation.engines import by_engine, start_of_scene
+from sdfsim.evaluation.engines import start_of_scene
 from sdfsim.evaluation.laws import hard_cases
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
@@ -47,19 +47,6 @@ def test_what_rests_stays_and_steps_are_timed(tmp_path, run, package, substeps):
     motion, timing = run(start, steps, substeps)
     assert np.abs(units.length * motion.position[:, 0] - [0, 0, 0.05]).max() < 0.002
     assert timing.cpu_ms > 0 and timing.first_ms > 0
-
-
-def test_the_teacher_has_the_scenes_own_masses_and_starts(tmp_path):
-    scene = hard_cases.tossed((3,))
-    motion = by_engine(scene, 0.04, bullet, tmp_path).motion
-    bodies = scene.bodies[:-1]
-    assert motion.position.shape == (3, len(bodies), 3)
-    np.testing.assert_allclose(motion.position[0], [b.position for b in bodies], atol=1e-12)
-    np.testing.assert_allclose(motion.velocity[0], [b.velocity for b in bodies], atol=1e-6)
-    high = [k for k, b in enumerate(bodies) if b.position[2] > 1.5]
-    assert high
-    fallen = np.array([bodies[k].velocity[2] for k in high]) - 10.0 * 0.04
-    np.testing.assert_allclose(motion.velocity[-1, high, 2], fallen, atol=1e-6)
 
 
 def test_an_inertia_other_than_the_engine_s_is_refused_where_a_recording_has_it(tmp_path):

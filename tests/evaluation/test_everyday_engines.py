@@ -18,7 +18,6 @@ from benchmarks.everyday import (
     GROUPS,
     OURS,
     NotRun,
-    cell,
     counted,
     is_installed,
     judged,
@@ -226,10 +225,6 @@ def test_the_table_counts_and_names_what_is_missed_or_absent():
     assert "- edges: b" in notes and "- PyBullet: slow, 2 checks" in notes
 
 
-def test_costs_stand_beside_the_checks_that_hold():
-    assert cell({"held": ["a"], "missed": ["b"], "not_run": {}, "cost": [1.5, 0.012]}) == "1 / 2, 1.5 s, 1.2 %"
-
-
 @pytest.mark.parametrize("name", FAST)
 def test_engines_are_given_no_soft_materials_and_only_mujoco_joints(name):
     scene = scene_of(Put("it", CUBE, [0, 0, 2]), floor())
@@ -237,7 +232,3 @@ def test_engines_are_given_no_soft_materials_and_only_mujoco_joints(name):
     held = replace(scene, joints=(Joint("hinge", "hinge", (0, -1), np.zeros(3), np.array([0.0, 0.0, 1.0])),))
     assert unknown_to(name, scene) == "" and "stiffness" in unknown_to(name, soft)
     assert unknown_to(name, held) == ("" if name == "MuJoCo" else "joints")
-
-
-def test_every_engine_names_its_package():
-    assert next(iter(ENGINES)) == OURS and all(package.isidentifier() for package, _ in ENGINES.values())

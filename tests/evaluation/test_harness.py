@@ -3,14 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.evaluation.harness import Job, Line, Panel, digest, draw, front, markdown, measure, number, peak_memory
+from sdfsim.evaluation.harness import Job, digest, front, measure
 from sdfsim.learned.model import new_network
 from sdfsim.physics.solver import code_cache
 from sdfsim.shape.make import analytic_shape
@@ -94,14 +93,3 @@ def test_front_is_what_nothing_beats(points):
     found = front(time, error)
     assert sorted(found) == [k for k, lost in enumerate(beaten) if not lost]
     assert [time[k] for k in found] == sorted(time[k] for k in found)
-
-
-def test_tables_plots_and_memory(tmp_path):
-    assert markdown([("a", "b"), ("1", "2")]) == "| a | b |\n| --- | ---: |\n| 1 | 2 |\n"
-    assert [number(v) for v in (None, 0.012345, 12345.6, np.inf)] == ["-", "0.0123", "12,346", "-"]
-    panels = [Panel("title", "x", "y", [Line("one", [1, 2], [3, 4], [0.1, 0.1])], "xy", 3.5)] * 5
-    draw(panels, tmp_path / "a.png")
-    assert (tmp_path / "a.png").read_bytes()[:4] == b"\x89PNG"
-    with peak_memory() as memory:
-        np.ones(32 * 2**20).sum()  # 256 MiB
-    assert memory["mib"] is None or memory["mib"] == pytest.approx(256, abs=32)

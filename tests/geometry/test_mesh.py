@@ -6,7 +6,7 @@ import pytest
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, convex_hull, is_closed, normal_frame, sample_surface, signed_volume
+from sdfsim.geometry.mesh import Mesh, clean, is_closed, sample_surface, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh, load_pieces, write_ply
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 
@@ -91,20 +91,6 @@ def test_box_mass_properties_are_exact_wherever_it_is() -> None:
     np.testing.assert_allclose(inertia, turn @ expected @ turn.T, atol=1e-8)
 
 
-def test_round_solids_converge_to_their_closed_forms() -> None:
-    volume, com, inertia = mass_properties(primitives.sphere(0.7, subdivisions=5))
-    assert volume == pytest.approx(4 / 3 * np.pi * 0.7**3, rel=2e-3)
-    np.testing.assert_allclose(com, 0, atol=1e-12)
-    np.testing.assert_allclose(inertia, 0.4 * volume * 0.49 * np.eye(3), rtol=3e-3, atol=1e-9)
-    major, minor = 0.4, 0.1
-    volume, _, inertia = mass_properties(primitives.torus(major, minor, 256, 128))
-    assert volume == pytest.approx(2 * np.pi**2 * major * minor**2, rel=1e-3)
-    assert inertia[2, 2] == pytest.approx(volume * (major**2 + 0.75 * minor**2), rel=2e-3)
-    volume, com, _ = mass_properties(primitives.cone(0.5, 1.0, 512))
-    assert volume == pytest.approx(np.pi * 0.25 / 3, rel=1e-3)
-    assert com[2] == pytest.approx(-0.25, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("sdf", "volume", "inertia"),
     [
@@ -117,15 +103,6 @@ def test_grid_integrals_agree_with_closed_forms(sdf, volume: float, inertia) -> 
     assert got == pytest.approx(volume, rel=5e-3)
     np.testing.assert_allclose(com, 0, atol=1e-9)
     np.testing.assert_allclose(moment, volume * np.diag(inertia), rtol=1e-2, atol=1e-9)
-
-
-def test_normal_frame_takes_the_longest_side_to_one() -> None:
-    bounds = np.array([[1.0, 2.0, 3.0], [2.0, 6.0, 5.0]])
-    frame = normal_frame(bounds)
-    np.testing.assert_allclose(frame.inward(bounds), [[-0.125, -0.5, -0.25], [0.125, 0.5, 0.25]])
-    np.testing.assert_allclose(frame.outward(frame.inward(bounds)), bounds)
-    with pytest.raises(SdfsimError, match="no extent"):
-        normal_frame(np.zeros((2, 3)))
 
 
 def test_surface_samples_lie_on_faces_in_proportion_to_area() -> None:
@@ -150,9 +127,3 @@ def test_pieces_are_the_hulls_of_the_groups(tmp_path: Path) -> None:
         volume, com, _ = mass_properties(piece)
         assert volume == pytest.approx(1.0)
         np.testing.assert_allclose(com, [shift, 0, 0], atol=1e-12)
-
-
-def test_hull_faces_point_outwards() -> None:
-    hull = convex_hull(np.random.default_rng(1).normal(size=(50, 3)))
-    assert is_closed(hull)
-    assert signed_volume(hull) > 0

@@ -10,7 +10,7 @@ from PIL import Image
 
 from sdfsim.apps.export import export
 from sdfsim.geometry.mesh import Mesh
-from sdfsim.geometry.mesh_io import load_textured, read_glb, write_glb
+from sdfsim.geometry.mesh_io import load_textured
 from sdfsim.geometry.skins import Painted, one_skin
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.shape.make import shape_from_mesh
@@ -326,14 +326,6 @@ def test_a_texture_that_is_turned_lies_turned(tmp_path: Path) -> None:
     )
     assert skin is not None and plain is not None and plain.uv is not None
     np.testing.assert_allclose(skin.uv, np.stack([plain.uv[:, 1], 1 - plain.uv[:, 0]], axis=1), atol=1e-6)
-
-
-def test_a_texture_far_from_the_origin_is_stored_where_it_is(tmp_path: Path) -> None:
-    box, image = sides(chessboard()), np.zeros((4, 4, 3), np.uint8)
-    vertices = np.add(box.vertices, [512345.27, 5401234.61, 331.0])
-    mesh = Mesh(vertices, np.array(box.faces), None, np.zeros((24, 2)), image)
-    (tmp_path / "far.glb").write_bytes(write_glb({"far": mesh}))
-    np.testing.assert_allclose(read_glb(tmp_path / "far.glb")["far"].vertices, mesh.vertices, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("textured", [True, False], ids=["texture", "plain"])

@@ -18,21 +18,6 @@ def total(rollout) -> np.ndarray:
     return rollout.counters["kinetic_energy"] + rollout.counters["potential_energy"]
 
 
-@pytest.mark.parametrize(("count", "seconds"), [(27, 0.5), pytest.param(512, 2.0, marks=pytest.mark.slow)])
-def test_balls_fall_into_a_bowl(model, count, seconds):
-    scene = gates.in_bowl(count)
-    rollout = Simulator(scene, model).run(seconds=seconds)
-    gates.assert_sound(rollout)
-    assert rollout.contact_count.sum() > count
-    potential, kinetic = rollout.counters["potential_energy"], rollout.counters["kinetic_energy"]
-    fallen = potential[0] - potential.min()
-    # Motion comes out of height alone, at every moment.
-    assert fallen > 0 and (kinetic <= potential[0] - potential + 0.01 * fallen).all()
-    assert (total(rollout) <= total(rollout)[0] + 0.01 * fallen).all()
-    below = rollout.position[:, gates.moving(scene), 2].min()
-    assert below > -0.01  # nobody through the bowl and the floor
-
-
 def resident() -> float:
     """MiB of memory that the process holds."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -86,11 +71,3 @@ def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
         np.testing.assert_array_equal(few.counters[name], many.counters[name], err_msg=name)
     assert few.counters["pairs"].sum() > 0
     np.testing.assert_array_equal(few.position[:, :4], many.position[:, :4])
-
-
-def test_masses_beyond_training_are_flagged(network):
-    """`simulate` and `plan` print these lines, see tests/apps/test_plan.py."""
-    lines = Simulator(gates.unequal(), network).outside_training
-    assert [line for line in lines if line.startswith("heaviest to lightest body: 1e+03 to 1e+03 here")]
-    scene = gates.placed(gates.CUBE, [(0, 0, 0.5), (0.1, 0, 1.55)], floor=True)
-    assert not [line for line in Simulator(scene, network).outside_training if "heaviest" in line]

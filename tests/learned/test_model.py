@@ -26,14 +26,6 @@ def test_a_model_that_goes_to_a_device_leaves_itself_behind(kind, dropped):
     assert {weight.device.type for weight in model.network.state_dict().values()} == {"cpu"}
 
 
-def test_nothing_is_copied_where_nothing_has_to_move(tmp_path):
-    model = random_model("impulse")
-    assert model.to("cpu") is model
-    model.save(tmp_path / "mine.safetensors")
-    unread = load_model(tmp_path / "mine.safetensors", weights=False)
-    assert unread.network is None and unread.to(META) is unread
-
-
 def test_a_model_of_an_earlier_version_ends_in_one_line():
     with pytest.raises(SdfsimError, match="'small' not found") as caught:
         load_model("small")

@@ -103,12 +103,6 @@ def test_a_solid_that_comes_to_edges_has_no_thin_walls(name):
     assert unseen_wall(sdf, finest(sdf, nodes)) is None
 
 
-def test_edges_are_thin():
-    mesh = convex_hull(np.array(CONVEX["wedge"], float))
-    grid = finest(MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)]))
-    assert grid.thickness <= 2.001 * grid.cell  # what made walls of them
-
-
 @pytest.mark.parametrize("wall", [0.001, 0.003])
 def test_a_hollow_solid_with_thin_walls_is_reported_of(wall):
     outer = analytic_shape("box", size=(1.0, 0.8, 0.6)).mesh
@@ -134,20 +128,6 @@ def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
         grid = replace(bar, pieces=known).contact.grid
         assert grid is not None
         np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
-
-
-def test_the_surface_of_pieces_has_a_patch_for_each():
-    pieces = two_halves()
-    bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
-    nodes = np.array([[-0.9, 0.0, 0.25], [0.4, 0.02, 0.08]])  # beside the surface, as those of a fitted SDF are
-    surface = patches_of(bar.sdf, nodes, pieces)
-    vertices = surface["node"][:-2]
-    assert {tuple(v) for v in vertices.round(9)} == {tuple(v) for v in np.concatenate(pieces).round(9)}
-    np.testing.assert_allclose(surface["node"][-2:], [[-0.9, 0.0, 0.2], [0.4, 0.02, 0.1]], atol=1e-6)
-    np.testing.assert_array_equal(surface["patch"], [0] * 8 + [1] * 8 + [0, 1])
-    places = np.array([[-0.8, 0.0, 0.2], [0.8, 0.0, 0.2]])
-    at = np.round((places - surface["label_low"]) / surface["label_cell"]).astype(int)
-    assert [int(surface["label"][tuple(k)]) for k in at] == [0, 1]
 
 
 def test_the_balls_of_leaves_hold_the_whole_surface(block):

@@ -12,7 +12,6 @@ from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.sdf.far_field import BOX, CAUTION
 from sdfsim.sdf.grid import GridSdf, sample_grid, trilinear
 from sdfsim.sdf.reference import MeshDistance
-from sdfsim.shape.surface_nodes import project
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 
@@ -39,13 +38,6 @@ def test_a_linear_field_comes_back_exactly() -> None:
     np.testing.assert_allclose(gradient, np.tile(slope, (500, 1)), atol=1e-5)
 
 
-def test_samples_are_met_on_the_grid_and_on_the_faces_of_the_box() -> None:
-    sdf = ball(12)
-    axis = np.linspace(-BOX, BOX, 12)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    np.testing.assert_allclose(sdf(points)[0], np.linalg.norm(points, axis=1) - 0.5, atol=1e-6)
-
-
 @pytest.mark.parametrize("which", ["values", "gradients"])
 def test_errors_shrink_with_the_cells(which: str) -> None:
     """Twice the samples: a quarter of the error in the distance, half of that in the gradient."""
@@ -59,20 +51,6 @@ def test_errors_shrink_with_the_cells(which: str) -> None:
     order = 2.0 if which == "values" else 1.0
     assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.25)
     assert np.log2(errors[1] / errors[2]) == pytest.approx(order, abs=0.25)
-
-
-def test_a_box_is_met_but_for_its_edges() -> None:
-    truth = BoxSdf((0.5, 0.3, 0.4))
-    sdf = sample_grid(truth, truth.bounds, 71)  # 0.02 a cell: faces run along samples
-    points = around(5000, 0.6)
-    distance, gradient = sdf(points)
-    exact = truth(points)
-    assert np.abs(distance - exact[0]).max() < 0.02
-    # A face, away from the others by a cell: the distance is linear there.
-    near = (np.abs(points[:, 0]) > 0.45) & (np.abs(points[:, 1]) < 0.22) & (np.abs(points[:, 2]) < 0.32)
-    assert near.sum() > 100
-    np.testing.assert_allclose(distance[near], exact[0][near], atol=1e-6)
-    np.testing.assert_allclose(gradient[near], exact[1][near], atol=1e-4)
 
 
 def test_the_gradient_is_that_of_the_value() -> None:
@@ -122,13 +100,6 @@ def test_never_nan_and_never_beside_the_grid(resolution: int) -> None:
         assert np.isfinite(part).all()
     # What is not a number stays none, rather than reading beside the grid.
     assert np.isnan(sdf(np.array([[np.nan, 0.0, 0.0]]))[0]).all()
-
-
-def test_projecting_by_value_and_gradient_reaches_the_surface() -> None:
-    points = around(500, 0.6)
-    points = points[np.linalg.norm(points, axis=1) > 0.2]
-    reached = project(ball(64), points)
-    np.testing.assert_allclose(np.linalg.norm(reached, axis=1), 0.5, atol=5e-4)
 
 
 def test_an_oracle_and_an_sdf_can_be_sampled() -> None:
@@ -196,9 +167,3 @@ def test_a_grid_sampled_near_the_surface_only_is_the_same_there(coarse):
     np.testing.assert_array_equal(near[close], whole[close])
     assert np.abs(near - whole).max() < 0.3 * block
     assert sum(asked) < 0.6 * 129**3
-
-
-def test_blocks_have_to_fill_a_grid():
-    ball = SphereSdf(0.5)
-    with pytest.raises(ValueError, match="multiple of coarse"):
-        sample_grid(ball, ball.bounds, 64, coarse=4)

@@ -62,13 +62,6 @@ def test_a_box_without_lid_is_not_closed_and_doubtful_at_the_hole() -> None:
     assert beside.distance[0] == pytest.approx(0.3, abs=1e-6)
 
 
-def test_one_piece_is_the_exact_convex_body() -> None:
-    points = points_in(1.0)
-    got = PiecesDistance([primitives.box((1.0, 0.6, 0.4))])(points)
-    truth, _ = BoxSdf((0.5, 0.3, 0.2))(points)
-    np.testing.assert_allclose(got.distance, truth, atol=1e-6)
-
-
 def test_touching_pieces_have_no_surface_between_them() -> None:
     # Two half boxes make one box; the shared face must not appear as a surface inside.
     half = primitives.box((0.5, 1.0, 1.0))

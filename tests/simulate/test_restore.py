@@ -119,15 +119,3 @@ def test_a_file_that_holds_no_state_is_refused(tmp_path):
         State.read(file)
     with pytest.raises(SdfsimError, match=r"none\.npz: no such file"):
         State.read(tmp_path / "none.npz")
-
-
-def test_a_door_that_slept_opens_once_more(simulator):
-    simulator.reset()
-    simulator.step(simulator.steps_in(2.0))
-    door = simulator.joint("door")
-    door.target = 1.2
-    kept = simulator.state
-    for _ in range(2):
-        simulator.restore(kept)
-        simulator.step(100)
-        assert door.target == pytest.approx(1.2) and door.angle == pytest.approx(1.2, abs=0.01)
