@@ -29,15 +29,6 @@ def seen(scene: Scene, rollout: sdfsim.Rollout, camera, look_at, time=0.0) -> np
     return np.abs(picture_at(fitted, scene, rollout, time, Style(smooth=True)).astype(int) - SKY).max(-1) > 8
 
 
-def test_a_ball_is_a_disc_of_the_right_size_in_the_middle():
-    scene, rollout = falling(position=(1.0, 2.0, 3.0))
-    picture = seen(scene, rollout, (1.0, 1.0, 3.0), (1.0, 2.0, 3.0))
-    radius = np.tan(np.arcsin(0.1)) / np.tan(np.radians(20.0)) * SIZE[1] / 2
-    assert picture.sum() == pytest.approx(np.pi * radius**2, rel=0.03)
-    row, column = (axis.mean() + 0.5 for axis in np.nonzero(picture))
-    assert (column, row) == pytest.approx((SIZE[0] / 2, SIZE[1] / 2), abs=1.0)
-
-
 HIGH = [(0.0, 0.0, 0.5 * k) for k in range(8)]
 ROW = [(0.5 * k, 0.0, 0.0) for k in range(8)]
 DEEP = [(0.0, 0.5 * k, 0.0) for k in range(8)]

@@ -52,16 +52,6 @@ def test_the_sign_is_trusted_by_the_angle_to_the_normal() -> None:
     assert got.distance[2] == pytest.approx(0.4)
 
 
-def test_a_box_without_lid_is_not_closed_and_doubtful_at_the_hole() -> None:
-    cube = primitives.box()
-    lid = (cube.vertices[cube.faces][:, :, 2] > 0.4).all(1)
-    oracle = MeshDistance(Mesh(cube.vertices, cube.faces[~lid]))
-    assert not oracle.closed
-    beside = oracle(np.array([[0.8, 0.0, -0.1]]))
-    assert beside.trusted[0]
-    assert beside.distance[0] == pytest.approx(0.3, abs=1e-6)
-
-
 def test_touching_pieces_have_no_surface_between_them() -> None:
     # Two half boxes make one box; the shared face must not appear as a surface inside.
     half = primitives.box((0.5, 1.0, 1.0))
