@@ -29,6 +29,7 @@ from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
 from sdfsim.simulate.record import at_frame
 from tests.helpers.command import run
+from tests.helpers.mujoco_start import at_start
 
 LINK = """
   <link name="{0}">
@@ -235,9 +236,7 @@ def servos(armature: float) -> str:
 def in_mujoco(file: Path, seconds: float) -> tuple[np.ndarray, int]:
     """Positions of joints at the end, and how often a motor's force changes its sign by more than a thousandth of the
     largest force."""
-    model = mujoco.MjModel.from_xml_path(str(file))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    model, data = at_start(file)
     forces = []
     while data.time < seconds:
         mujoco.mj_step(model, data)
@@ -511,9 +510,7 @@ def test_a_file_in_millimetres_moves_as_one_in_metres(tmp_path: Path) -> None:
         scene = jointed().add("bead", sphere={"radius": radius}, position=(5, 0, 2))
         report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
         lines.append([line for line in report["left_out"] if "in mm" in line])
-        model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
+        model, data = at_start(tmp_path / "out.xml")
         mujoco.mj_step(model, data, 100)  # before anything touches
         names = [body.name for body in jointed().load().bodies] + ["bead"]
         moved.append([(data.body(name).xpos.copy(), data.body(name).xmat.copy()) for name in names[1:]])
@@ -724,10 +721,7 @@ def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
 def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
     report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
+    model, data = at_start(tmp_path / "out.xml")
     for name, value in start_positions(scene).items():
         # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
         assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
@@ -736,8 +730,6 @@ def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
         assert data.body(body.name).xpos == pytest.approx(body.position, abs=1e-9)
         if body.motion == "dynamic":
             centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * shape.com)
-            speed = np.zeros(6)
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(body.name).id, speed, 0)
             assert data.body(body.name).xipos == pytest.approx(centre, abs=1e-9)
     assert float(model.joint("shoulder").damping[0]) == pytest.approx(0.2)
     assert model.joint("shoulder").range == pytest.approx(np.radians([-30, 70]))

@@ -6,7 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh  # noqa: TID253
 from PIL import Image
+from trimesh.visual import TextureVisuals  # noqa: TID253
+from trimesh.visual.material import PBRMaterial  # noqa: TID253
 
 from sdfsim.apps.export import export
 from sdfsim.geometry.mesh import Mesh
@@ -26,8 +29,6 @@ def chessboard(bright=(250, 250, 250), dark=(10, 10, 10)) -> Image.Image:
 
 def sides(image: Image.Image, *, repeats: float = 1.0) -> Any:
     """A trimesh of a cube of 1 m whose six sides each show the whole image."""
-    import trimesh
-
     vertices, faces, uv = [], [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):
@@ -38,9 +39,6 @@ def sides(image: Image.Image, *, repeats: float = 1.0) -> Any:
                 vertices.append((normal + (2 * a - 1) * u + (2 * b - 1) * v) / 2)
                 uv.append((repeats * a, repeats * b))
             faces += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
     material = PBRMaterial(baseColorTexture=image, baseColorFactor=[255, 255, 255, 255])
     visual = TextureVisuals(uv=uv, material=material)
     return trimesh.Trimesh(vertices, faces, visual=visual, process=False)
@@ -105,8 +103,6 @@ def test_a_chessboard_on_a_box_stays_a_chessboard(tmp_path: Path, ending: str) -
 
 
 def test_parts_with_images_of_their_own_share_one_and_repeat_as_often_as_they_did(tmp_path: Path) -> None:
-    import trimesh
-
     red, blue = chessboard((250, 0, 0), (0, 0, 0)), chessboard((0, 0, 250), (0, 0, 0))
     one, two = sides(red, repeats=2.0), sides(blue)
     two.apply_translation([3.0, 0.0, 0.0])
@@ -132,8 +128,6 @@ def test_what_cannot_be_kept_is_told(tmp_path: Path) -> None:
 
 
 def test_a_surface_that_is_inside_out_is_turned() -> None:
-    import trimesh
-
     cube = trimesh.creation.box()
     uv, image = np.zeros((8, 2)), np.full((1, 1, 3), 90, np.uint8)
     skin = one_skin([Painted(np.array(cube.vertices), np.array(cube.faces)[:, ::-1], uv, image)])
@@ -165,9 +159,6 @@ def assert_six_colors(skin: Mesh | None) -> None:
 
 @pytest.mark.parametrize("ending", ["obj", "glb", "ply", "glb with vertex colours"])
 def test_a_die_keeps_six_colours_wherever_they_come_from(tmp_path: Path, ending: str) -> None:
-    import trimesh
-    from trimesh.visual.material import PBRMaterial
-
     kind, die = ending.split()[0], sides(chessboard())
     file = tmp_path / f"die.{kind}"
     if kind == "obj":
@@ -203,8 +194,6 @@ def test_a_die_keeps_six_colours_wherever_they_come_from(tmp_path: Path, ending:
 
 
 def test_smooth_colours_stay_colours_of_vertices(tmp_path: Path) -> None:
-    import trimesh
-
     ball = trimesh.creation.icosphere(2, 0.5)
     shades = np.round(127 * (1 + 2 * ball.vertices)).astype(np.uint8)
     ball.visual.vertex_colors = np.column_stack([shades, np.full(len(shades), 255, np.uint8)])
@@ -280,8 +269,6 @@ def test_looks_that_are_lost_are_named(tmp_path, library: str, text: str, messag
 
 def gltf_box(tmp_path: Path, change) -> Path:
     """The textured box of trimesh as .gltf, with its JSON changed."""
-    import trimesh
-
     for name, data in trimesh.exchange.gltf.export_gltf(trimesh.Scene(sides(chessboard()))).items():
         (tmp_path / name).write_bytes(data)
     tree = json.loads((tmp_path / "model.gltf").read_text())
@@ -332,8 +319,6 @@ def test_a_texture_that_is_turned_lies_turned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mapped", [True, False], ids=["maps", "factors"])
 def test_roughness_metal_and_normal_maps_come_in_and_go_out(tmp_path: Path, textured: bool, mapped: bool) -> None:
     """From a file over a shape folder to an export, as trimesh reads it."""
-    import trimesh
-
     import sdfsim
 
     cells = np.arange(CELLS * CELLS, dtype=np.uint8).reshape(CELLS, CELLS)

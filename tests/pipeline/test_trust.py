@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh  # noqa: TID253
 
 from pipeline.cameras import View
 from pipeline.mesh.trust import Evidence, evidence_of, information, next_photos, sigma_along, summary
@@ -75,8 +76,6 @@ def test_the_guessed_part_of_a_body_is_reported():
 
 
 def test_attributes_survive_and_other_programs_read_the_mesh(tmp_path):
-    import trimesh
-
     block = cube(0.4)
     block = replace(block, colors=np.full(block.vertices.shape, 90, np.uint8))
     sure = np.where(np.arange(len(block.vertices)) == 3, np.inf, 0.001).astype(np.float32)
@@ -94,8 +93,6 @@ class Photographed:
     """The box on a floor within four walls of `photo_sets`, as photos from some poses show it."""
 
     def __init__(self, poses: list[np.ndarray]) -> None:
-        import trimesh
-
         make = studio()
         # The walls are sheets that photos show from one side; here the box and its floor are enough.
         parts = still_life(make, 1)
@@ -124,8 +121,6 @@ class Photographed:
 
 def finer(mesh: Mesh) -> Mesh:
     """The mesh in triangles of 7 cm at most."""
-    import trimesh
-
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, 0.07)[:2]
     made = trimesh.Trimesh(vertices, faces, process=True)
     return Mesh(np.asarray(made.vertices), np.asarray(made.faces, np.int64))
