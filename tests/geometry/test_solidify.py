@@ -6,11 +6,15 @@ import pytest
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
+from sdfsim.geometry.bvh import Around
+from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, sample_surface, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh
+from sdfsim.geometry.primitives import PRIMITIVES, convex_pieces, sphere
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf
-from sdfsim.sdf.reference import MeshDistance
+from sdfsim.sdf.reference import MeshDistance, PiecesDistance
+from tests.helpers.surfaces import cube
 
 CUBE = primitives.box()
 BALL = primitives.sphere(0.5, subdivisions=4)
@@ -329,3 +333,77 @@ def test_meshes_from_the_field(file: str, solid: bool, data_dir: Path) -> None:
         solidify(mesh, name=file)
     thick = solidify(mesh, name=file, thicken=0.03 * float(np.ptp(mesh.vertices, axis=0).max()))
     assert is_closed(thick.surface)
+
+
+# Side, middle of each box, by case: the last two are one box in the same place.
+CASES = {
+    "crossing": ((1.0, (0, 0, 0)), (0.6, (0.4, 0.3, 0.2))),
+    "flush": ((1.0, (0, 0, 0)), (0.5, (0.75, 0.1, 0.0)), (0.5, (0.0, 0.25, 0.75))),
+    "one inside the other": ((1.0, (0, 0, 0)), (0.5, (0.1, 0.0, 0.0))),
+    "twice in one place": ((1.0, (0, 0, 0)), (1.0, (0, 0, 0))),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("middle", [(0.0, 0.0, 0.0), (300.0, -200.0, 50.0)])
+def test_winding_numbers_count_the_boxes_around_a_point(case, middle):
+    boxes = [(side, np.add(at, middle)) for side, at in CASES[case]]
+    mesh = joined([Mesh(cube(side).vertices + at, cube(side).faces) for side, at in boxes])
+    points = np.random.default_rng(0).uniform(-1, 1.2, (20_000, 3)) + middle
+    off = np.array([np.abs(points - at).max(1) - side / 2 for side, at in boxes])  # signed, but beyond edges
+    clear = np.abs(off).min(0) > 1e-4
+    np.testing.assert_allclose(Around(mesh)(points[clear]), (off[:, clear] < 0).sum(0), atol=0.05)
+
+
+# Handles of each solid (its genus): V - E + F = 2 - 2 * handles.
+HANDLES = {
+    "box": 0,
+    "sphere": 0,
+    "cylinder": 0,
+    "cone": 0,
+    "torus": 1,
+    "gear": 1,
+    "torus_knot": 1,
+    "bowl": 0,
+    "shoe": 0,
+}
+
+
+@pytest.mark.parametrize("kind", PRIMITIVES)
+def test_every_primitive_is_a_closed_outward_solid_near_a_metre(kind: str) -> None:
+    mesh = PRIMITIVES[kind]()
+    assert is_closed(mesh)
+    assert signed_volume(mesh) > 0
+    assert 0.85 < np.ptp(mesh.vertices, axis=0).max() <= 1.0 + 1e-9
+    if kind in HANDLES:
+        euler = len(mesh.vertices) - len(mesh.faces) // 2
+        assert euler == 2 - 2 * HANDLES[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "empty"), [("torus", [0, 0, 0]), ("gear", [0, 0, 0]), ("bowl", [0, 0, -0.2]), ("shoe", [-0.2, 0, 0.05])]
+)
+def test_holes_are_open(kind: str, empty: list[float]) -> None:
+    assert MeshDistance(PRIMITIVES[kind]())(np.array([empty], dtype=float)).distance[0] > 0.02
+
+
+@pytest.mark.parametrize("kind", [kind for kind in PRIMITIVES if kind != "shoe"])
+def test_convex_pieces_fill_the_solid(kind: str) -> None:
+    mesh, pieces = PRIMITIVES[kind](), convex_pieces(kind)
+    low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+    points = np.random.default_rng(0).uniform(low, high, (20_000, 3))
+    inside = MeshDistance(mesh)(points).distance < 0
+    filled = PiecesDistance(pieces).inside(points)
+    # Facets of round walls are coarser in the pieces.
+    assert (filled & inside).sum() > 0.88 * (filled | inside).sum()
+
+
+def test_no_pieces_where_there_is_no_simple_way() -> None:
+    assert convex_pieces("shoe") == []
+
+
+def test_sphere_vertices_are_on_the_sphere() -> None:
+    mesh = sphere(0.25, subdivisions=2)
+    np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.25)
+    assert len(mesh.faces) == 320
+    assert mass_properties(mesh)[0] < 4 / 3 * np.pi * 0.25**3

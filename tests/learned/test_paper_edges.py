@@ -15,7 +15,9 @@ from sdfsim.physics.free_flight import with_history
 from sdfsim.physics.options import Options
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import load_shape
 from tests.helpers.scenes import contact_edges, make_body
+from tests.helpers.shapes import SHAPES
 
 GRAVITY = np.array([0.0, 0.0, -10.0])
 REACH, DT = 0.1, 0.02
@@ -151,3 +153,32 @@ def test_a_moving_body_needs_mass_and_nodes():
     for scene in (plane, weightless):
         with pytest.raises(SdfsimError, match="needs a mass"):
             from_scene(scene, Units(1.0, 1.0, 1.0))
+
+
+FAR, STEP = 0.05, 0.02
+
+
+def test_fitted_shapes_with_many_nodes_keep_every_edge():
+    """Balls of nodes are left out by distances that are not exact: none may hold a node that has an edge."""
+    ring = load_shape(SHAPES / "ring")
+    size = float(np.ptp(ring.sdf.bounds, axis=0).max())
+    rng = np.random.default_rng(0)
+    bodies = [
+        make_body(f"b{k}", 0, rng.uniform(-0.5, 0.5, 3), scale=1 / size, quat_xyzw=Rotation.random(rng=rng).as_quat())
+        for k in range(6)
+    ]
+    bodies, state = from_scene(Scene((ring,), tuple(bodies), np.zeros(3), 1.0), Units(1.0, 1.0, 1.0))
+    _, _, found = contact_edges(bodies, state, np.zeros(3), FAR, STEP)
+    missing = 0
+    for j in range(6):
+        turned = Rotation.from_quat(state.orientation)
+        for i in range(6):
+            if i == j:
+                continue
+            mine = slice(int(bodies.node_start[i]), int(bodies.node_start[i + 1]))
+            world = state.position[i] + turned[i].apply(bodies.node[mine])
+            local = turned[j].inv().apply(world - state.position[j]) + bodies.com[j]
+            near = np.asarray(ring.sdf(local * size)[0]) / size <= 0.0499
+            held = found.node[(found.owner == i) & (found.body == j)] - mine.start
+            missing += int((~np.isin(np.flatnonzero(near), held.numpy())).sum())
+    assert missing == 0 and len(found) > 100

@@ -1,5 +1,6 @@
 """The sample scenes do what their first lines say."""
 
+import runpy
 from functools import cache
 from pathlib import Path
 
@@ -119,3 +120,21 @@ def test_the_rollers_carry_both_parcels_through_the_gate_and_down_the_chute():
 
 def test_the_mobile_arm_pushes_the_box_off_the_shelf():
     assert track("mobile_arm", "box")[-1, 2] < 0.3 and track("mobile_arm", "base")[-1, 0] > 1.2
+
+
+SCRIPT = Path(__file__).resolve().parents[2] / "samples" / "nut.py"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.0, 0.2])
+def test_a_nut_goes_down_by_its_pitch_a_turn_or_locks(friction, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["nut.py", str(tmp_path), "--friction", str(friction), "--seconds", "0.8"])
+    runpy.run_path(str(SCRIPT), run_name="__main__")
+    turns, way = (float(word) for word in capsys.readouterr().out.split()[0:3:2])
+    if friction:
+        assert turns == pytest.approx(0.0, abs=0.01)
+        assert way < 0.2
+    else:
+        assert 1.2 < turns < 1.7
+        assert way == pytest.approx(2.0 * turns, abs=0.15)
+    assert (tmp_path / "nut.mp4").is_file()
