@@ -1,4 +1,5 @@
-"""What films show is found again: rendered ones of motions in closed form. Films that show nothing end in a line."""
+"""What films show is found again: rendered ones of motions in closed form, of rooms and of moved supports. Films that
+show nothing end in a line."""
 
 import json
 from dataclasses import replace

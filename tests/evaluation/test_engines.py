@@ -1,5 +1,5 @@
-"""Other engines run everyday scenes as ours does: they move as closed forms say, and what they cannot express or finish
-is told, not failed."""
+"""Other engines run everyday scenes as ours does: they move as closed forms say, and what they cannot express or
+finish is told, not failed."""
 
 from collections.abc import Iterator
 from dataclasses import replace

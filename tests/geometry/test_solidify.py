@@ -1,3 +1,5 @@
+"""Meshes become solids, whatever their faces; winding numbers and primitives."""
+
 import time
 from pathlib import Path
 

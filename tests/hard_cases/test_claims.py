@@ -1,4 +1,4 @@
-"""Files that claim more than they hold: weights, arrays, archives, pictures and meshes."""
+"""Files that claim more than they hold, are cut short or changed, and two runs in one folder: one clear line each."""
 
 import json
 import struct

@@ -1,9 +1,10 @@
-"""Rows 1 to 5, 7 and 8: what every run of every bundled model keeps to, whatever it has learned.
+"""What every run of every bundled model keeps to, whatever it has learned: motion, degenerate shapes, crowds, and
+states that cannot be.
 
-Of untrained networks the same is tested in tests/physics/test_free_flight.py and tests/learned/test_impulse.py.
-"""
+Of untrained networks the same is tested in tests/physics/test_free_flight.py and tests/learned/test_inference.py."""
 
 import gc
+import json
 import os
 import subprocess
 import sys
@@ -13,10 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.spatial.transform import Rotation
 
 import sdfsim
+from sdfsim import Rollout
 from sdfsim.base.errors import SdfsimError
+from sdfsim.learned import inference
 from sdfsim.physics.bodies import State
 from sdfsim.scene.scene import Effects
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
@@ -24,6 +28,7 @@ from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 from sdfsim.simulate.simulator import Simulator
 from tests.hard_cases import gates
+from tests.helpers.command import run
 from tests.helpers.scenes import contact_edges, make_body, random_model, surface_model
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -330,3 +335,55 @@ def test_ten_thousand_static_bodies_cost_one_mover_what_ten_do(model):
         np.testing.assert_array_equal(few.counters[name], many.counters[name], err_msg=name)
     assert few.counters["pairs"].sum() > 0
     np.testing.assert_array_equal(few.position[:, :4], many.position[:, :4])
+
+
+def breaking(monkeypatch, at_call: int, name: str, value: float) -> None:
+    """At its `at_call`th call the network on bodies answers `value` in the array `name`, for the last body."""
+    real, calls = inference.stepped, []
+
+    def stepped(*given) -> State:
+        calls.append(1)
+        after = real(*given)
+        if len(calls) == at_call:
+            broken = getattr(after, name).copy()
+            broken[-1, 0] = value
+            after = replace(after, **{name: broken})
+        return after
+
+    monkeypatch.setattr(inference, "stepped", stepped)
+
+
+def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatch):
+    scene, out = tmp_path / "scene.yaml", tmp_path / "run"
+    scene.write_text(
+        "version: 1\nduration: 1\nshapes: {ball: {sphere: {radius: 0.5}}}\n"
+        "bodies:\n  - {name: floor, plane: {}}\n  - {name: ball, shape: ball, position: [0, 0, 0.52]}\n"
+    )
+    at = int(np.random.default_rng(7).integers(3, 20))
+    breaking(monkeypatch, at, "velocity", np.nan)
+    done = run("simulate", scene, "-o", out, "--json", "--model", "gnn")
+    assert done.exit_code == 3 and json.loads(done.stdout)["exit_code"] == 3
+    rollout, report = Rollout.load(out / "rollout.npz"), json.loads((out / "report.json").read_text())
+    # The network is first asked when the ball meets the floor.
+    last = report["steps"]
+    assert len(rollout) == last >= at - 1 and report["status"] == "failed"
+    gates.assert_sound(rollout)
+    assert report["error"].startswith(f"step {last + 1}: body 'ball': ") and report["error"] in done.stderr
+    assert f"the last good state is that of step {last}" in report["error"]
+    assert (out / "rollout.rrd").stat().st_size > 0 and yaml.safe_load((out / "config.yaml").read_text())
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"position": np.array([0.0, np.nan, 1.0])}, "body 'b0': position is not finite"),
+        ({"position": np.array([1e15, 0.0, 1.0])}, "too far to be placed exactly"),
+        ({"quat_xyzw": np.array([0.0, 0.0, 0.0, 2.0])}, "orientation is not a unit quaternion"),
+    ],
+)
+def test_a_start_that_cannot_be_is_told_before_any_step(fields, told):
+    scene = gates.placed(gates.CUBE, [(0, 0, 1)])
+    broken = replace(scene, bodies=(replace(scene.bodies[0], **fields),))
+    with pytest.raises(SdfsimError, match=told) as caught:
+        Simulator(broken, random_model("impulse"))
+    assert caught.value.exit_code == 1

@@ -1,4 +1,5 @@
-"""Scenes outside a model's training are flagged, in the scene's own units; scaled ones inside are not."""
+"""Models on devices, their cards, and scenes outside of their training, which are flagged in the scene's own
+units."""
 
 import re
 from dataclasses import replace

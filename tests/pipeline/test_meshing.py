@@ -1,4 +1,5 @@
-"""The mesh stage as a whole, on a field that is drawn by hand: a table with a cup on it, and a speck in the air."""
+"""The mesh stage as a whole, on a field that is drawn by hand: a table with a cup on it, and a speck in the air;
+textures."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Bodies on level planes against scenes whose signed distance is known exactly."""
+"""Bodies on level planes, and bodies that touch, against scenes whose signed distance is known exactly."""
 
 from __future__ import annotations
 

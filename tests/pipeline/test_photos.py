@@ -1,4 +1,4 @@
-"""Reading photos: what is accepted, and one clear line for each thing that is not."""
+"""Reading photos: what is accepted, how sharp they are, and one clear line for each that is not."""
 
 import base64
 import io

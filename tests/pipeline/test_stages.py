@@ -1,4 +1,5 @@
-"""Stages: skipped when unchanged, done again when not, resumed when killed; nothing of the user's is lost."""
+"""Stages: skipped when unchanged, done again when not, resumed when killed; nothing of the user's is lost. What a run
+reports, also where it stopped."""
 
 import json
 import shutil

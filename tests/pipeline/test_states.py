@@ -1,4 +1,5 @@
-"""Photos of one thing in two states: what is refused, how poses are shared, and the scene with its joint."""
+"""Photos of one thing in two states: what is refused, how poses are shared, which joint moves it, and the scene with
+it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Training as a whole: held-out photos, budgets and resuming, and training that goes wrong."""
+"""Training as a whole: held-out photos, budgets and resuming, training that goes wrong, and hollows that photos see
+into."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

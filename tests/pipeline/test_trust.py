@@ -1,4 +1,4 @@
-"""How far a surface can be trusted, against closed forms and renderings whose answer is known."""
+"""How far a surface and its hollows can be trusted, against closed forms and renderings whose answer is known."""
 
 from collections.abc import Sequence
 from dataclasses import replace

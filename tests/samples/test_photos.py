@@ -1,4 +1,4 @@
-"""What samples/photos/make.py draws is solid."""
+"""What samples/photos/make.py draws is solid, and the ball of its last scene flies at the body."""
 
 import importlib.util
 import shutil

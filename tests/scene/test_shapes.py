@@ -1,21 +1,29 @@
-"""What a scene file is told of its shapes: where they go, which resolution would do, and by which name they go."""
+"""Shapes of a scene file: what is told of them, their centres, hollows and round forms, and SDFs of every kind."""
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+import sdfsim
 from sdfsim import load_scene
 from sdfsim.base.errors import SceneError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.mesh_io import wavefront, write_ply
+from sdfsim.geometry.primitives import box
+from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.scene.builder import SceneBuilder, loaded
 from sdfsim.scene.scene import Scene
-from sdfsim.sdf.closed_forms import CylinderSdf
+from sdfsim.sdf.closed_forms import BoxSdf, CylinderSdf
+from sdfsim.sdf.grid import GridSdf
+from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import with_sdf
 from sdfsim.simulate.simulator import Simulator
+from tests.helpers.scene_files import problems_of
 
 
 def write_box(path, size) -> None:
@@ -189,3 +197,147 @@ def test_what_is_not_round_says_so(tmp_path) -> None:
     (tmp_path / "box.obj").write_text(wavefront([primitives.box()]))
     scene = loaded(SceneBuilder().add("box", mesh=tmp_path / "box.obj", round="auto"))
     assert "no round solid: it collides as it is" in scene.notes[0]
+
+
+def ball(radius: float) -> tuple[float, np.ndarray]:
+    """Volume m^3 and inertia [3] m^5 of a solid one."""
+    volume = 4 / 3 * np.pi * radius**3
+    return volume, np.full(3, 0.4 * volume * radius**2)
+
+
+def block(size) -> tuple[float, np.ndarray]:
+    """The same of a block with sides of `size` [3] m."""
+    squares = np.square(size)
+    return np.prod(size), np.prod(size) / 12 * (squares.sum() - squares)
+
+
+SIDES = np.array([0.2, 0.13, 0.31])
+SHAPES = {
+    "ball": ("sphere: {radius: 0.1}", lambda wall: ball(0.1 - wall)),
+    "block": ("box: {size: [0.2, 0.13, 0.31]}", lambda wall: block(SIDES - 2 * wall)),
+}
+
+
+def walled(load, shape: str, scale: float = 1.0) -> Scene:
+    body = f"{{name: it, shape: it, density: 500, scale: {scale}}}"
+    return load(f"version: 1\nshapes:\n  it: {{{shape}}}\nbodies:\n  - {body}\n")
+
+
+@pytest.mark.parametrize("scale", [1.0, 2.0])
+@pytest.mark.parametrize("name", SHAPES)
+def test_mass_and_inertia_are_those_of_what_is_left_around_the_hollow(load, name, scale):
+    shape, inside = SHAPES[name]
+    (volume, inertia), (hollow, missing) = inside(0.0), inside(0.004)
+    scene = walled(load, f"{shape}, wall: 0.004", scale)
+    assert scene.bodies[0].mass == pytest.approx(500 * (volume - hollow) * scale**3, rel=0.01)
+    bodies, _ = from_scene(scene, Units(1.0, 1.0, 1.0))
+    wanted = 500 * np.diag(inertia - missing) * scale**5
+    np.testing.assert_allclose(bodies.inertia[0], wanted, rtol=0.01, atol=1e-3 * wanted.max())
+    np.testing.assert_allclose(bodies.com[0], 0, atol=1e-6)
+
+
+def test_a_wall_thicker_than_the_shape_makes_it_solid(load):
+    solid, walled = (walled(load, f"sphere: {{radius: 0.1}}{more}") for more in ("", ", wall: 0.2"))
+    assert walled.bodies[0].mass == pytest.approx(solid.bodies[0].mass, rel=1e-3)
+
+
+def test_a_wall_changes_nothing_outside(load):
+    solid, walled = (walled(load, f"sphere: {{radius: 0.1}}{more}").shapes[0] for more in ("", ", wall: 0.004"))
+    points = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 3))
+    np.testing.assert_array_equal(solid.sdf(points)[0], walled.sdf(points)[0])
+    np.testing.assert_array_equal(solid.nodes, walled.nodes)
+
+
+CRATE = {
+    "box": "{box: {size: [0.4, 0.4, 0.4]}}",
+    "grid": "{primitive: {name: box, size: 0.4}, sdf: grid, resolution: 64}",
+    "asset": "{asset: crate, sdf: grid}",
+    "file": "{mesh: crate.ply, units: cm, sdf: mesh}",
+}
+
+
+def falling_ball(crate: str) -> str:
+    return f"""version: 1
+shapes:
+  crate: {crate}
+  ball: {{sphere: {{radius: 0.1}}}}
+bodies:
+  - {{name: floor, plane: {{}}}}
+  - {{name: crate, shape: crate, position: [0, 0, 0.2], mass: 1}}
+  - {{name: ball, shape: ball, position: [0.03, 0.02, 0.52], velocity: [0, 0, -1], mass: 0.5}}
+"""
+
+
+@pytest.fixture
+def no_fit(monkeypatch):
+    monkeypatch.setattr("sdfsim.shape.make.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
+
+
+def heights(scene: Scene) -> np.ndarray:
+    """[15, 3, 3] m: where the bodies are, step by step."""
+    simulator = Simulator(scene, model="solver")
+    return np.stack([np.asarray(state.position) for state in simulator.steps(15)])
+
+
+def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit):
+    crate = analytic_shape("box", size=(0.4, 0.4, 0.4))
+    crate.save(tmp_path / "crate")
+    larger = replace(crate.mesh, vertices=100 * crate.mesh.vertices)
+    (tmp_path / "crate.ply").write_bytes(write_ply(larger))
+    scenes = {key: load(falling_ball(shape)) for key, shape in CRATE.items()}
+    kinds = {key: type(scene.shapes[1].sdf) for key, scene in scenes.items()}
+    assert kinds == {"box": BoxSdf, "grid": GridSdf, "asset": GridSdf, "file": MeshSdf}
+    assert all(scene.missed == () for scene in scenes.values())
+    expected = heights(scenes["box"])
+    # Without the crate it would be half a metre lower by now.
+    assert 0.49 < expected[-1, 2, 2] < 0.51
+    # Samples round corners off by 0.4 mm, and the impact falls into one inner step or the next.
+    for key, scene in scenes.items():
+        np.testing.assert_allclose(heights(scene), expected, atol=0.02, err_msg=key)
+
+
+def test_an_asset_keeps_its_own_sdf_unless_reported_and_cannot_grow_a_network(load, tmp_path):
+    with_sdf(analytic_shape("box", size=(0.4, 0.4, 0.4)), "mesh").save(tmp_path / "crate")
+    assert isinstance(load(falling_ball("{asset: crate}")).shapes[1].sdf, MeshSdf)
+    (fault,) = problems_of(load, falling_ball("{asset: crate, sdf: mlp}"))
+    assert fault == "scene.yaml:3: shapes.crate.asset: box: the shape has no SDF network (fit its mesh)"
+
+
+def test_a_shape_of_parts_has_their_mass_and_rests_on_them(tmp_path):
+    """A dumbbell of a bar and two boxes, with a lamp that is only shown; its box alone would tip over."""
+    (tmp_path / "lamp.obj").write_text(wavefront([box((0.1, 0.1, 0.1))]))
+    scene = sdfsim.Scene(duration=1.0, model="solver").add("floor", plane={}, restitution=0)
+    parts = [
+        {"box": {"size": (0.2, 0.2, 0.2)}, "position": (0.4, 0, 0), "color": (200, 0, 0)},
+        {"box": {"size": (0.2, 0.2, 0.2)}, "position": (-0.4, 0, 0)},
+        {"box": {"size": (0.6, 0.1, 0.1)}, "euler_xyz_deg": (0, 0, 0)},
+        {"mesh": str(tmp_path / "lamp.obj"), "scale": 2.0, "position": (0, 0, 0.3), "use": "shown"},
+        {"sphere": {"radius": 0.05}, "position": (0, 0, 0.05), "use": "touch"},
+    ]
+    scene.add("bell", parts=parts, position=(0, 0, 0.1), restitution=0, density=100)
+    loaded = load_scene(scene.save(tmp_path / "scene.yaml"), allow_outside=True)
+    shape, mass = loaded.shapes[1], loaded.bodies[1].mass
+    # The bar is 0.6 m between the boxes; half of the sphere is above it.
+    assert mass == pytest.approx(100 * (2 * 0.2**3 + 0.6 * 0.01 + 2 / 3 * np.pi * 0.05**3), rel=0.01)
+    assert shape.skin is not None and shape.skin.vertices[:, 2].max() == pytest.approx(0.4)
+    assert shape.mesh.vertices[:, 2].max() == pytest.approx(0.1, abs=1e-3)
+    rollout = sdfsim.Simulator(loaded).run()
+    assert rollout.position[-1, 1] == pytest.approx(rollout.position[0, 1], abs=2e-4)
+    again = sdfsim.Scene.read(tmp_path / "scene.yaml", allow_outside=True).load()
+    assert again.bodies[1].mass == pytest.approx(mass)
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ([{"box": {"size": (1, 1, 1)}, "scale": 2}], "parts[0].scale: is for a mesh only"),
+        ([{"box": {"size": (1, 1, 1)}, "use": "shown"}], "parts: one part must not be use: shown"),
+        ([{"position": (0, 0, 1)}], "parts[0]: one of mesh, sphere, capsule, cylinder, box is required"),
+        ([{"capsule": {"radius": 1, "height": 1}}], "parts[0].capsule.height: must be above twice the radius"),
+        ([{"mesh": "none.obj"}], "parts[0].mesh: no such file"),
+    ],
+)
+def test_parts_that_make_no_shape_are_told(parts, told):
+    with pytest.raises(SceneError) as caught:
+        sdfsim.Scene().add("a", parts=parts)
+    assert any(told in problem for problem in caught.value.problems)

@@ -1,3 +1,5 @@
+"""Certificates of fits, and the distances to meshes and pieces that they are held to."""
+
 import json
 from collections.abc import Callable
 

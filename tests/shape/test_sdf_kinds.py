@@ -1,4 +1,4 @@
-"""Grids and exact meshes in place of the network."""
+"""Grids and exact meshes in place of the network, and the cache of fitted shapes."""
 
 from dataclasses import replace
 from pathlib import Path

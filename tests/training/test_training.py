@@ -1,4 +1,5 @@
-"""Training on a handful of recorded steps: it learns, it resumes to the bit, it leaves no pickle."""
+"""Training on a handful of recorded steps: it learns, it resumes to the bit, it leaves no pickle; what its batches
+and contact frames hold."""
 
 import shutil
 from dataclasses import fields, replace
