@@ -19,12 +19,10 @@ from sdfsim.apps.recording import (
     save_reconstruction,
     save_rollout,
 )
-from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import box
 from sdfsim.physics.rollout import Rollout
-from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.camera import Camera
-from sdfsim.simulate.looks import FARTHEST, framed, shown
+from sdfsim.simulate.looks import FARTHEST, framed
 from tests.helpers.runs import read
 
 STEPS = 6
@@ -171,38 +169,6 @@ def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_pat
     np.testing.assert_allclose(arrows[3][0], hit, rtol=1e-5)
     np.testing.assert_allclose(found["/world/forces"]["Arrows3D:origins"][4][0], rollout.position[4, 3], rtol=1e-6)
     assert [len(row) for row in found["/world/still"]["Points3D:positions"]] == [0, 1, 1, 0, 0]
-
-
-def test_a_plane_lies_below_scenery_that_lies_in_it_and_stays_elsewhere(scene):
-    """So that a floor from photos, uneven by millimetres, does not flicker through the floor without end."""
-    for k, body in enumerate(scene.bodies):  # a brick of closed form beside it
-        if scene.shapes[body.shape].name == "plane":
-            assert (shown(scene, k, 9.0).vertices[:, 2] == 0.0).all()
-    rng = np.random.default_rng(0)
-    side = np.linspace(-2, 2, 30)
-    uneven = np.column_stack([np.stack(np.meshgrid(side, side), -1).reshape(-1, 2), rng.uniform(-0.01, 0.01, 900)])
-    at = np.arange(900).reshape(30, 30)[:-1, :-1].reshape(-1, 1)
-    faces = np.concatenate([at + np.array([0, 1, 31]), at + np.array([0, 31, 30])])
-    ground = replace(scene.shapes[1], mesh=Mesh(uneven, faces), sdf=load_shape("samples/shapes/bowl").sdf)
-    below = replace(scene, shapes=(scene.shapes[0], ground, *scene.shapes[2:]))
-    names = [shape.name for shape in scene.shapes]
-    assert names[0] == "plane" and names[1] == "brick"
-    below = replace(
-        below, bodies=tuple(replace(b, position=np.zeros(3)) if b.name == "shelf" else b for b in scene.bodies)
-    )
-    plane = shown(below, 0, 9.0)
-    corners = plane.vertices[plane.faces]
-    height, middle = corners[..., 2], corners.mean(1)
-    assert (np.ptp(height, axis=1) == 0.0).all()
-    inside = (np.abs(middle[:, :2]) < 1.9).all(1)
-    down = -height[inside]
-    assert inside.any() and (down == down[0, 0]).all() and (uneven[:, 2] + down[0, 0] > 0).mean() > 0.98
-    assert down[0, 0] < 0.05
-    # Where nothing lies in it, it is shown where bodies meet it; and all of it is there, with no gap between the two.
-    away = (np.abs(middle[:, :2]) > 2.3).any(1)
-    assert (height[away] == 0.0).all()
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    assert area[away].sum() + 4.6**2 >= 18.0**2 - 5.0 and area[height[:, 0] == 0.0].sum() < 18.0**2 - 3.8**2
 
 
 def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):

@@ -1,7 +1,6 @@
 """What is compiled is told before it is waited for: once, where it is not kept, and nothing else is said."""
 
 import importlib.util
-import os
 import time
 from pathlib import Path
 
@@ -26,30 +25,6 @@ def loaded(file: Path):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.double
-
-
-def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path, monkeypatch):
-    from numba.core import config
-
-    file = tmp_path / "doubling.py"
-    file.write_text(SOURCE)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
-    first = loaded(file)
-    assert not is_compiled(first)
-    assert first(3) == 6 and is_compiled(first)
-    again = loaded(file)
-    assert not again.signatures and is_compiled(again)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "other"))
-    assert not is_compiled(loaded(file))
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
-    copy = tmp_path / "elsewhere" / "doubling.py"
-    copy.parent.mkdir()
-    copy.write_text(SOURCE)
-    assert not is_compiled(loaded(copy))
-    file.write_text(SOURCE + "# another version\n")
-    os.utime(file, (1, 1))
-    assert not is_compiled(loaded(file))
-    assert is_compiled(loaded(copy).py_func)  # runs as Python
 
 
 @pytest.mark.parametrize("cache", ["True", "False"])

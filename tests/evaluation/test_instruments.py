@@ -220,14 +220,6 @@ def test_a_stick_that_passes_through_another_is_told_with_few_frames_measured():
     assert told.frames < 10 and told.overlap is not None and told.overlap.part > 0.1
 
 
-def test_a_cube_that_sinks_into_a_thin_floor_is_told():
-    sheet = analytic_shape("box", size=(100.0, 100.0, 0.1))
-    sunk = make_body("cube", 1, [0.03, 0.02, 0.05 - 0.02])
-    scene = Scene((sheet, CUBE), (static("sheet", 0, [0, 0, -0.05]), sunk), G, 1.0)
-    verdict = judged(scene, still(scene))
-    assert verdict.overlap is not None and verdict.overlap.metres == pytest.approx(0.02, rel=0.01)
-
-
 def test_bodies_that_may_not_touch_may_be_in_each_other():
     scene = crossing(-0.02)
     apart = replace(scene, bodies=(scene.bodies[0], replace(scene.bodies[1], collides_with=())))

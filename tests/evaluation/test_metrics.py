@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim.evaluation.metrics import compared, energy, energy_gain, interval, resting, speeds, survival
+from sdfsim.evaluation.metrics import compared, energy, energy_gain, resting, speeds, survival
 from tests.helpers.recordings import balls
 
 
@@ -24,14 +24,6 @@ def test_rotation_error_is_the_mean_angle_and_ignores_the_quaternions_sign():
         for sign, turns in ((1.0, truth), (-1.0, truth * turn))
     )
     assert compared(turned, recorded, slice(None))[1] == pytest.approx(20.0)
-
-
-def test_interval_covers_the_mean_and_shrinks_with_more_data():
-    values = np.random.default_rng(1).normal(2.0, 1.0, size=400)
-    low, high = interval(values)
-    assert low < values.mean() < high
-    few = interval(values[:25])
-    assert high - low < 0.5 * (few[1] - few[0])
 
 
 def flight(seconds: float = 1.0, **fields):

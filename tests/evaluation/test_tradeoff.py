@@ -11,10 +11,8 @@ import torch
 pytest.importorskip("pybullet")
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.batching import every, first_frames
 from sdfsim.evaluation import tradeoff as study
 from sdfsim.evaluation.tradeoff import Variant, arranged, load_cases
-from sdfsim.physics.motion import MOTION
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
 
@@ -32,20 +30,6 @@ def test_networks_and_shapes_are_what_a_setting_says(cases):
     assert len(few) == 10 and (np.abs(np.abs(few) - [0.5, 0.3, 0.2]).max(1) < 1e-9).sum() == 8
     grid = arranged(Variant("solver", nodes="grid 6"), cases)["box"].nodes
     assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
-
-
-@pytest.mark.parametrize(("steps", "stride"), [(60, 1), (60, 2), (61, 2), (30, 2), (31, 2)])
-def test_half_as_many_steps_are_judged_over_the_same_time(cases, steps, stride):
-    """A motion that drifts from its recording at a constant speed has the errors of that speed."""
-    recorded = [replace(t, **{name: np.repeat(getattr(t, name)[:1], 62, 0) for name in MOTION}) for t in cases.recorded]
-    few = replace(cases, recorded=[first_frames(t, steps + 1) for t in recorded])
-    drift = 0.01 * np.arange(steps + 1)[:, None, None] * [1.0, 0, 0]
-    motions = [every(replace(t, position=t.position + drift), stride) for t in few.recorded]
-    found = study._judged(motions, few, stride)["translation_rmse"]
-    assert list(found) == sorted({str(min(50, steps)), str(steps)}, key=int)
-    for horizon, error in found.items():
-        at = 0.01 * stride * np.arange(1, int(horizon) // stride + 1)
-        assert error == pytest.approx(np.sqrt((at**2).mean()), rel=1e-6)
 
 
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):

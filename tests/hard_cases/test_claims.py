@@ -3,14 +3,12 @@
 import json
 import struct
 import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from safetensors.torch import load_file, save_file
 
-from pipeline.inputs.images import read_photo
 from sdfsim import SdfsimError, load_shape
 from sdfsim.base import files
 from sdfsim.base.files import LOCK, locked, read_arrays
@@ -98,32 +96,6 @@ def test_arrays_are_never_objects(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.array([{"a": 1}], dtype=object))
     with pytest.raises(SdfsimError, match="cannot be read as arrays"):
         read_arrays(tmp_path / "a.npz", "arrays")
-
-
-def png(width: int, height: int) -> bytes:
-    """A picture that claims a size, with hardly any data."""
-
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
-    )
-
-
-def test_a_photo_of_absurd_size_is_refused_before_it_is_decoded(tmp_path):
-    for size in ((100_000, 100_000), (2**31 - 1, 2**31 - 1), (2**31 - 1, 64)):
-        (tmp_path / "a.png").write_bytes(png(*size))
-        with pytest.raises(SdfsimError, match=r"too large|cannot be decoded"):
-            read_photo(tmp_path / "a.png", 800)
-
-
-def test_a_photo_is_nothing_that_a_program_would_have_to_draw(tmp_path):
-    page = "%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n(x) run showpage\n%%EOF\n"
-    (tmp_path / "a.jpg").write_text(page)
-    with pytest.raises(SdfsimError, match="not an image"):
-        read_photo(tmp_path / "a.jpg", 800)
 
 
 def test_a_gltf_cannot_claim_what_is_not_there(tmp_path):

@@ -371,19 +371,3 @@ def test_a_run_on_disk_is_readable_up_to_the_last_good_step(tmp_path, monkeypatc
     assert report["error"].startswith(f"step {last + 1}: body 'ball': ") and report["error"] in done.stderr
     assert f"the last good state is that of step {last}" in report["error"]
     assert (out / "rollout.rrd").stat().st_size > 0 and yaml.safe_load((out / "config.yaml").read_text())
-
-
-@pytest.mark.parametrize(
-    ("fields", "told"),
-    [
-        ({"position": np.array([0.0, np.nan, 1.0])}, "body 'b0': position is not finite"),
-        ({"position": np.array([1e15, 0.0, 1.0])}, "too far to be placed exactly"),
-        ({"quat_xyzw": np.array([0.0, 0.0, 0.0, 2.0])}, "orientation is not a unit quaternion"),
-    ],
-)
-def test_a_start_that_cannot_be_is_told_before_any_step(fields, told):
-    scene = gates.placed(gates.CUBE, [(0, 0, 1)])
-    broken = replace(scene, bodies=(replace(scene.bodies[0], **fields),))
-    with pytest.raises(SdfsimError, match=told) as caught:
-        Simulator(broken, random_model("impulse"))
-    assert caught.value.exit_code == 1

@@ -13,7 +13,6 @@ from pipeline.cameras import View
 from pipeline.field.grid_field import (
     BACKGROUND_SAMPLES,
     Background,
-    Bricks,
     FieldSize,
     GridField,
     differences,
@@ -241,23 +240,6 @@ def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bri
         color = field.color_of(geometry, features, points)
     np.testing.assert_allclose(color.mean(0), [0.8, 0.5, 0.2], atol=0.02)
     assert off < 0.35 * rough  # the error of linear interpolation goes with the square of the cell
-
-
-def test_bricks_are_added_once_and_features_stay_what_they_were():
-    fused = ball_fused()
-    field = GridField(FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,)), 0, fused=fused)
-    level, count = field.bricks[0], len(fused.bricks)
-    assert isinstance(level, Bricks)
-    level.values.data += torch.arange(len(level.values))[:, None]
-    before = level.values.detach().clone()
-    line = torch.linspace(-1, 1, 24)
-    cache = torch.stack(torch.meshgrid(line, line, line, indexing="ij"), -1)
-    shifted = (cache - torch.tensor([0.0, 0.0, 0.1])).norm(dim=-1, keepdim=True) - 0.5
-    field.refine(shifted)
-    assert len(level.places) > count and len({tuple(place) for place in level.places.tolist()}) == len(level.places)
-    assert torch.equal(level.values[: len(before)], before) and not level.values[len(before) :].any()
-    field.refine(shifted)
-    assert len(level.values) == 64 * len(level.places) == len(level.start)
 
 
 @pytest.mark.parametrize("killed", [10, 18])

@@ -19,7 +19,7 @@ from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.placement import located_bodies
-from pipeline.mesh.seams import Part, Seam, flood, solid_of
+from pipeline.mesh.seams import Seam, flood, solid_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.geometry.bvh import Caster, Winding
@@ -180,26 +180,6 @@ def test_what_is_no_body_stays_scenery(scene, seen, why):
     assert parts.solid is not None and signed_volume(parts.solid) == pytest.approx(
         signed_volume(surface_of(scene).solid)
     )
-
-
-def test_what_seams_split_off_inside_of_a_body_is_no_body(monkeypatch):
-    """A block on a table, which seams divide in two halves and a core that no photo sees: two bodies, no core left."""
-    low, half = np.array([0.1, -0.05, TOP + 0.15]), 0.15
-    scene = lambda p: np.minimum(table(p), box(p, low, (half, half, half)))  # noqa: E731
-    core = lambda p: np.linalg.norm(p - low, axis=-1) - 0.08  # noqa: E731
-
-    def parted(surface, body, *rest) -> tuple[list[Part], str, str]:
-        points = Volume(np.zeros(body.own.shape), body.low, body.cell).points()
-        left, inner = points[..., 0] - low[0], core(points)
-        values = [np.maximum(left, -inner), np.maximum(-left, -inner), inner]
-        seams = [Volume(value.astype(np.float32), body.low, body.cell) for value in values]
-        return [Part(0, seam, [n for n in range(3) if n != k]) for k, seam in enumerate(seams)], "shape", ""
-
-    monkeypatch.setattr(bodies, "_parted", parted)
-    parts = parts_of(scene)
-    assert list(parts.bodies) == ["object1", "object2"] and parts.touching == [("object1", "object2", "shape")]
-    total = sum(signed_volume(mesh) for mesh in parts.bodies.values())
-    assert total == pytest.approx((2 * half) ** 3, rel=0.05)  # The core is 8 % of it.
 
 
 def test_a_body_that_two_photos_see_is_none():

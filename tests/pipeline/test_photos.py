@@ -33,15 +33,17 @@ def encoded(kind: str, width: int, height: int) -> bytes:
     return data.getvalue()
 
 
-def absurd() -> bytes:
-    """A PNG of a few bytes that claims 100,000 px a side."""
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
-    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0")), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+def png(width: int, height: int, bits: int, color: int, rows: bytes, more: bytes = b"") -> bytes:
+    """A PNG that claims a size, with rows of so many bits a channel; `more` chunks lie behind its head."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)) + more
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+DRAWING = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n(x) run showpage\n%%EOF\n"
 
 
 @pytest.mark.parametrize(
@@ -54,7 +56,11 @@ def absurd() -> bytes:
         (3, "cut.png", encoded("PNG", 400, 300)[:40_000], "cut.png: cannot be decoded"),
         (3, "cut.webp", encoded("WEBP", 400, 300)[:40_000], "cut.webp: cannot be decoded"),
         (3, "cut.avif", encoded("AVIF", 400, 300)[:20_000], "cut.avif: "),
-        (3, "bomb.png", absurd(), "bomb.png: too large (100000 x 100000"),
+        (3, "9.jpg", DRAWING, "9.jpg: not an image"),  # which a program would have to draw
+        # Claims that are refused before anything is decoded.
+        (3, "bomb.png", png(100_000, 100_000, 8, 2, b"\0"), "bomb.png: too large (100000 x 100000"),
+        (3, "bomb.png", png(2**31 - 1, 2**31 - 1, 8, 2, b"\0"), "bomb.png: "),
+        (3, "bomb.png", png(2**31 - 1, 64, 8, 2, b"\0"), "bomb.png: "),
         (3, "x.png", encoded("PNG", 20, 20), "x.png: too small"),
     ],
 )
@@ -159,17 +165,11 @@ RAMP = np.stack([np.tile(np.linspace(0, 1, 120), (80, 1)), np.tile(np.linspace(0
 EIGHT = (255 * RAMP + 0.5).astype(int)
 
 
-def png16(values: np.ndarray) -> bytes:
+def png16(values: np.ndarray, more: bytes = b"") -> bytes:
     """A PNG of 16 bits a channel, written by hand: grey, grey and alpha, RGB or RGBA [H, W, C]."""
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
     height, width, channels = values.shape
-    header = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return png(width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], rows, more)
 
 
 def shown(path: Path) -> np.ndarray:
@@ -268,10 +268,7 @@ def test_deep_photos_are_turned_upright(tmp_path, orientation, kind):
     if kind == "png":
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = orientation
-        body = exif.tobytes()[6:]
-        chunk = struct.pack(">I", len(body)) + b"eXIf" + body + struct.pack(">I", zlib.crc32(b"eXIf" + body))
-        data = png16(deep)
-        path.write_bytes(data[:33] + chunk + data[33:])
+        path.write_bytes(png16(deep, chunk(b"eXIf", exif.tobytes()[6:])))
     else:
         tifffile.imwrite(path, RAMP.astype(np.float32) if kind == "float" else deep, photometric="rgb",
                          extratags=[(274, 3, 1, orientation, True)])  # fmt: skip

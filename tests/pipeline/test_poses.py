@@ -319,31 +319,6 @@ def test_a_finished_attempt_is_not_run_again(tmp_path, monkeypatch):
     assert run_worker(job, tmp_path / "try", 1.0, lambda fraction, message: None) == {"views": []}
 
 
-@pytest.mark.parametrize(
-    ("pairs", "left"), [(None, []), ([["c.jpg", "a.jpg"], ["b.jpg", "c.jpg"]], [("a.jpg", "b.jpg")])]
-)
-def test_features_of_an_attempt_are_matched_again_where_they_should(tmp_path, pairs, left):
-    import pycolmap
-
-    names = ["a.jpg", "b.jpg", "c.jpg"]
-    with pycolmap.Database.open(tmp_path / "first.db") as opened:
-        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9.0, 4.5, 4.5])
-        camera.camera_id = opened.write_camera(camera)
-        number = {name: opened.write_image(pycolmap.Image(name=name, camera_id=camera.camera_id)) for name in names}
-        for k, a in enumerate(names):
-            opened.write_keypoints(number[a], np.full((5, 2), k, np.float32))
-            for b in names[k + 1 :]:
-                matched = np.tile(np.arange(5, dtype=np.uint32)[:, None], 2)
-                opened.write_matches(number[a], number[b], matched)
-                opened.write_two_view_geometry(number[a], number[b], pycolmap.TwoViewGeometry(inlier_matches=matched))
-    job = {"features_of": str(tmp_path / "first.db"), "pairs": pairs}
-    worker.take_features(job, tmp_path / "database.db")
-    counts, verified = worker.read_pairs(pycolmap, tmp_path / "database.db")
-    assert counts == dict.fromkeys(names, 5) and [pair[:2] for pair in verified] == left
-    with pycolmap.Database.open(tmp_path / "database.db") as opened:
-        assert len(opened.read_all_matches()[0]) == len(left)
-
-
 def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     write_json(tmp_path / "job.json", {"count": 4})
     (tmp_path / "database.db").write_text("old")

@@ -11,12 +11,8 @@ from pipeline.cameras import PosedPhotos, Sparse
 from pipeline.field.grid_field import FieldSize, GridField
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import (
-    CLEARANCE,
-    FILLED,
     GAP,
-    JUST_EMPTY,
     NOISES,
-    SLOPE,
     STEREO_POINTS,
     DepthPoints,
     FreeSpace,
@@ -28,11 +24,6 @@ from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
 CELL = 2 / 127  # of the preset quick
-
-
-def ball_cache(radius: float, n: int = 65) -> torch.Tensor:
-    line = torch.linspace(-1, 1, n)
-    return (torch.stack(torch.meshgrid(line, line, line, indexing="ij")).norm(dim=0) - radius)[..., None]
 
 
 def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
@@ -92,37 +83,6 @@ def test_points_of_stereo_are_those_that_are_certain():
     right, below = (found @ view.rotation.T + view.translation)[:, :2].T > [[0], [-1]]
     assert len(found) == STEREO_POINTS and len(np.unique(found, axis=0)) == STEREO_POINTS
     assert right.mean() == pytest.approx(2 / 3, abs=0.03) and below.all()
-
-
-def crossing(count: int) -> np.ndarray:
-    """Lines along x, evenly spread in y: few of them cross a ball of radius 0.1."""
-    y = np.linspace(-0.9, 0.9, count)
-    return np.stack([np.full(count, -0.4), y, 0 * y, np.full(count, 0.4), y, 0 * y], 1)
-
-
-def test_half_the_points_are_where_free_space_is_filled():
-    sight = crossing(400)
-    free = FreeSpace(sight, CELL, "cpu")
-    rng = torch.Generator().manual_seed(0)
-    evenly, _ = free.pick(200, rng)
-    assert (evenly.norm(dim=1) < 0.1).float().mean() < 0.1
-    free.look(ball_cache(0.1), rng)
-    assert len(free.filled) > 50
-    points, clearance = free.pick(200, rng)
-    filled = points.norm(dim=1) < 0.1 + FILLED * CELL + 0.01
-    assert filled[:100].all() and filled[100:].float().mean() < 0.1
-    rest = 0.4 - points[:, 0] + GAP * CELL
-    expected = (SLOPE * rest).clamp_max(CLEARANCE * CELL)
-    torch.testing.assert_close(clearance[100:], expected[100:])
-    torch.testing.assert_close(clearance[:100], expected[:100].clamp_max(JUST_EMPTY * CELL))
-
-
-def test_nothing_is_filled_in_an_empty_field():
-    free = FreeSpace(crossing(50), CELL, "cpu")
-    rng = torch.Generator().manual_seed(0)
-    free.look(ball_cache(0.1) * 0 + 1, rng)
-    assert len(free.filled) == 0 and len(free.pick(64, rng)[0]) == 50
-    assert len(FreeSpace(np.zeros((0, 6)), CELL, "cpu").pick(64, rng)[0]) == 0
 
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 1.35])

@@ -17,7 +17,6 @@ from pipeline.mesh.extraction import (
     islands,
     sample_box,
     sample_volume,
-    trusted_vertices,
 )
 from pipeline.mesh.placement import (
     Scale,
@@ -96,15 +95,6 @@ def test_patches_of_a_large_surface_are_left_out_but_not_small_things():
     lower = mesh.vertices[mesh.faces][:, :, 2].max(1) < -0.4
     assert faces[lower].any() and not found[lower].any()
     assert found[len(faces) // 2 :].all() and (found == faces)[~lower].all()
-
-
-def test_trusted_vertices_close_gaps_but_not_where_the_solid_was_cut_off():
-    mesh = sample_volume(ball(radius=0.5), 33, extent=1.0).mesh()
-    count = np.full(len(mesh.vertices), 3)
-    count[10] = 0
-    nowhere = np.zeros(len(count), bool)
-    assert trusted_vertices(mesh, count, nowhere).all()
-    assert not trusted_vertices(mesh, count, ~nowhere).any()
 
 
 def test_a_vertex_behind_something_is_not_seen():
@@ -334,7 +324,6 @@ def test_parallel_cameras_stand_apart_as_their_points_see_them():
 
 
 METRES = 3.0  # a unit of normalised space in the world that the photos were taken in
-UP = np.array([0.0, 0, 1])
 
 
 def named(views: list[View]) -> list[View]:

@@ -47,13 +47,6 @@ def test_two_cameras_tell_depth_as_the_stereo_formula_says(baseline, away):
     assert sigma_along(total, side)[0] == pytest.approx(away / focal / np.sqrt(2), rel=1e-9)
 
 
-def test_one_line_of_sight_tells_nothing_along_it():
-    views = pair(0.4, 2.0)
-    point, up = np.zeros((1, 3)), np.array([[0.0, 0, 1]])
-    assert np.isinf(sigma_along(information(views[0], point), up)).all()
-    assert np.isinf(sigma_along(3 * information(views[0], point), up)).all()
-
-
 def test_what_is_behind_something_is_guessed():
     floor = plate(20)
     wall = plate(4, z=0.5, half=0.2)

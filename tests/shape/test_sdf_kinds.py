@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sdfsim import load_scene
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
@@ -159,22 +158,3 @@ def test_what_the_cache_knows_a_mesh_by_is_all_that_it_describes(tmp_path: Path,
     colors = np.zeros((len(cube.vertices), 3), dtype=np.uint8)
     digests = {cube.digest(), replace(cube, colors=colors).digest(), replace(cube, colors=colors + 1).digest()}
     assert len(digests) == 3
-
-
-def test_a_fit_that_nobody_sees_is_reported_once(tmp_path: Path, quick: None, caplog: pytest.LogCaptureFixture) -> None:
-    told = "making the shape cup, once for this mesh"
-    (tmp_path / "cup.ply").write_bytes(write_ply(primitives.cone(segments=12)))
-    text = "version: 1\nshapes: {cup: {mesh: cup.ply, sdf: mlp}}\nbodies: [{name: a, shape: cup, mass: 1}]\n"
-    (tmp_path / "scene.yaml").write_text(text)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "one"))
-        load_scene(tmp_path / "scene.yaml")
-        assert [record.levelname for record in caplog.records if told in record.message] == ["WARNING"]
-        load_scene(tmp_path / "scene.yaml")
-        assert caplog.text.count(told) == 1
-        caplog.clear()
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "other"))
-        load_scene(tmp_path / "scene.yaml", lambda fraction, message: None)
-        assert told not in caplog.text
-        shape_from_mesh(tmp_path / "cup.ply", tmp_path / "third")
-        assert caplog.text.count(told) == 1
