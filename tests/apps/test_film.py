@@ -218,7 +218,7 @@ def test_a_body_that_leaves_the_picture_is_said(tmp_path):
     def away(time: float) -> tuple[np.ndarray, np.ndarray]:
         return np.array([[0, 0, 0], [-0.5 + 2.2 * time, 0, 0.35]]), np.array([LEVEL, LEVEL])
 
-    clip = filmed(tmp_path / "clip.mp4", ball_scene().load(), away, camera, 1.0, 30, subframes=1)
+    clip = filmed(tmp_path / "clip.mp4", ball_scene().load(), away, camera, 0.7, 30, subframes=1)
     with pytest.raises(SdfsimError, match="leaves the picture after"):
         sdfsim.track(clip, ball_scene())
 

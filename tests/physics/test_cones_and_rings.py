@@ -95,7 +95,9 @@ PARTNERS = {
 }
 
 
-@pytest.mark.parametrize("other", PARTNERS)
+@pytest.mark.parametrize(
+    "other", [pytest.param(name, marks=[] if name in ("box", "can") else [pytest.mark.slow]) for name in PARTNERS]
+)
 def test_a_ring_meets_others_on_its_true_surface(other: str) -> None:
     """Dropped on others that are fixed, without friction and at random, it never gets deeper than its size allows by
     the distance of fine triangles, and never rests in the air."""

@@ -19,7 +19,7 @@ from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, Sp
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
 from tests.reference.solids import KINDS, Solid, is_sharp, least_depth, overlap, placed, views, width
 
-BLOCK, BLOCKS, MANY = 500, 6, 200  # pairs of a test; tests of the fast suite, and of both: 3,000 and 100,000 pairs
+BLOCK, BLOCKS, MANY = 500, 3, 200  # pairs of a test; tests of the fast suite, and of both: 1,500 and 100,000 pairs
 GAPS = (0.0, 1e-6, 1e-3, 0.1, 1.0, -1e-6, -1e-3, -1e-2, -3e-2)  # of the smaller thickness
 REACH = 0.015  # of the smaller body: points are told of gaps up to here
 FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf, "cone": ConeSdf}

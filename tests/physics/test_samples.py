@@ -51,7 +51,7 @@ def verdict(text: str, folder: Path, mesh: Mesh, seconds: float) -> Verdict:
     return judged(scene, Simulator(scene).run(seconds=seconds), seconds=60.0, every=5)
 
 
-@pytest.mark.parametrize("size", [0.05, 0.3])
+@pytest.mark.parametrize("size", [0.05, pytest.param(0.3, marks=pytest.mark.slow)])
 def test_a_cup_tips_over_its_round_foot(size, tmp_path):
     """Its foot is a polygon of 72 sides, of which a node holds every third or fourth: the surface between them is met
     as well."""
