@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import typeof
+from numba.core import config
 
 from sdfsim.base import compiling
 from sdfsim.base.compiling import compile_before, is_compiled
@@ -29,8 +30,6 @@ def loaded(file: Path):
 
 @pytest.mark.parametrize("cache", ["True", "False"])
 def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, caplog, cache):
-    from numba.core import config
-
     (tmp_path / f"doubling_{cache}.py").write_text(SOURCE.replace("True", cache))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
@@ -64,8 +63,6 @@ def test_a_scene_compiles_the_pieces_that_it_needs(monkeypatch):
 
 def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
     """Arrays of another layout need code of their own, which used to be compiled without a word."""
-    from numba.core import config
-
     (tmp_path / "layouts.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))

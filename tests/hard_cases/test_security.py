@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sdfsim import SceneError, SdfsimError, load_scene
+from sdfsim.apps import viewer
 from sdfsim.geometry.mesh_io import load_mesh, write_ply
 from sdfsim.geometry.primitives import box
 from sdfsim.shape.make import analytic_shape
@@ -183,7 +184,6 @@ def listening(port: int) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc/net, which tells who listens where, exists on Linux only")
 def test_the_live_viewer_listens_on_this_machine_only(home, monkeypatch):
-    from sdfsim.apps import viewer
     from sdfsim.apps.recording import Playback
 
     monkeypatch.setattr(viewer, "has_screen", lambda: False)
@@ -206,8 +206,6 @@ if "--web-viewer-port" in sys.argv:
 
 @pytest.mark.parametrize("web", [False, True])
 def test_every_viewer_is_told_where_to_listen(tmp_path, monkeypatch, web):
-    from sdfsim.apps import viewer
-
     (tmp_path / "a.rrd").write_bytes(b"RRF2")
     told = tmp_path / "told"
     fake = tmp_path / "rerun"

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -200,8 +201,6 @@ def test_what_is_no_capture_is_reported(tmp_path):
 
 @pytest.mark.parametrize("name", ["../outside.txt", "..\\outside.txt", "{}/outside.txt"])
 def test_a_zip_does_not_write_outside_of_its_folder(tmp_path, name):
-    import zipfile
-
     with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
         archive.writestr(name.format(tmp_path), "no")
     with pytest.raises(SdfsimError, match="photos found: 0"):
@@ -211,8 +210,6 @@ def test_a_zip_does_not_write_outside_of_its_folder(tmp_path, name):
 
 def wrapped(given: Path, archive: Path, above: str, separator: str = "/", previews: int = 3) -> Path:
     """A zip of a folder, or of what another zip holds, in one more folder, with what macOS and apps put beside it."""
-    import zipfile
-
     if given.is_dir():
         content = {path.relative_to(given).as_posix(): path.read_bytes() for path in given.rglob("*") if path.is_file()}
     else:

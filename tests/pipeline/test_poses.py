@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.cameras import load_views
 from pipeline.inputs.photos import prepare_photos
 from pipeline.sfm import poses, worker
 from pipeline.sfm.agreement import agreement, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
+from pipeline.sfm.worker import turn_only, zooms_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
 from tests.helpers.photos import photo, result, turned
@@ -353,16 +355,12 @@ def test_a_wrong_focal_length_shows_in_how_far_the_matches_lie(times, right):
 
 
 def test_zooms_are_reported_apart_by_the_focal_lengths_of_each_photo_alone():
-    from pipeline.sfm.worker import zooms_of
-
     focals = {"a": 700.0, "b": 1030.0, "c": 680.0, "d": 1060.0, "e": 735.0}
     assert zooms_of([*"abcdef"], focals) == [["c", "a", "e"], ["b", "d"], ["f"]]
     assert zooms_of([*"ace"], focals) == [["c", "a", "e"]] and zooms_of(["f"], focals) == [["f"]]
 
 
 def test_turning_on_the_spot_is_reported_from_walking():
-    from pipeline.sfm.worker import turn_only
-
     rng = np.random.default_rng(0)
     size = {"width": 640, "height": 480}
     directions = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (300, 3))
@@ -402,8 +400,6 @@ def zoomed(folder: Path, count: int, zooms: dict[int, float]) -> tuple[dict[str,
 @pytest.mark.parametrize("zooms", [{}, {2: 1.5}, {2: 2.0}, {5: 1.4}])
 def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
     from pycolmap import estimate_sim3d
-
-    from pipeline.cameras import load_views
 
     focals, centers = zoomed(tmp_path / "in", 20, zooms)
     photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=640)
@@ -542,8 +538,6 @@ def test_a_lens_of_another_kind_is_refused_and_named(monkeypatch, tmp_path):
 def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch):
     """Their names tell nothing: a quarter of the pairs is matched, and all are posed, the loop around the table
     closed."""
-    from pipeline.cameras import load_views
-
     shuffled = np.random.default_rng(4).permutation(48)
     (tmp_path / "in").mkdir()
     for number, path in zip(shuffled, sorted((TABLE_VASE / "images").iterdir()), strict=True):

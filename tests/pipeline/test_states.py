@@ -29,6 +29,7 @@ from pipeline.states import reconstruct_states
 from sdfsim.base.errors import EXIT_QUALITY, EXIT_USAGE, SdfsimError
 from sdfsim.geometry.mesh import Mesh, joined
 from sdfsim.geometry.mesh_io import write_ply
+from sdfsim.scene.load import load_scene
 from tests.helpers.command import run as command
 from tests.helpers.photos import noise
 
@@ -128,8 +129,6 @@ def test_a_joint_moves_with_its_world_and_survives_its_file(tmp_path):
 
 def test_the_scene_starts_in_the_first_state_and_goes_to_the_second(tmp_path):
     """The meshes are those of the second state, in which the door, 0.6 m wide, is open by 60 degrees."""
-    from sdfsim.scene.load import load_scene
-
     placement = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "given")
     origins = {PART: np.array([0.15, 0.26, 0.0]), "object1": np.array([0.0, -1.0, 0])}
     text = scene_text(placement, origins, None, scenery=False, held=HELD, holder="object1")
@@ -155,7 +154,6 @@ def test_the_scene_starts_in_the_first_state_and_goes_to_the_second(tmp_path):
 def test_a_part_does_not_touch_what_it_starts_in(tmp_path):
     """A door that photos put 3 mm into the floor cannot leave its hinge."""
     from sdfsim.scene.collision_filter import contact_groups
-    from sdfsim.scene.load import load_scene
 
     placement = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "given")
     origins = {PART: np.array([0.15, 0.26, -0.003]), "object1": np.array([0.0, -1.0, 0]), "cup": np.array([0, 2.0, 0])}
