@@ -110,7 +110,6 @@ def test_a_box_that_slides_shows_its_friction(tmp_path):
     value = {(e.kind, e.name): e for e in found.estimates}
     slid = value["friction", "box / floor"]
     assert slid.value == pytest.approx(friction, abs=0.03)
-    assert slid.interval is not None
     assert slid.interval[0] < friction < slid.interval[1]
     assert value["restitution", "box / floor"].value is None
 
@@ -317,7 +316,6 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     again = sdfsim.load_scene(tmp_path / "identified.yaml")
     plank = next(b for b in again.bodies if b.name == "plank")
     assert plank.motion == "kinematic"
-    assert plank.path is not None
     for time, quat in zip(plank.path.time, plank.path.quat_xyzw, strict=True):
         off = Rotation.from_quat(quat) * lie(float(time))[1].inv()
         assert abs(np.degrees(off.as_rotvec()[1])) < 1.0, time  # in the plane of the picture, nearly
@@ -367,7 +365,6 @@ def test_a_path_is_smooth_where_frames_are_not():
     track.seen[7] = None
     clip = Clip(Path("clip.mp4"), time + 3.0, np.zeros((55, 2, 2, 3), np.uint8))
     path = with_paths(clip, eye, scene, [track]).bodies[1].path
-    assert path is not None
     assert len(path.time) == 54
     off = path.position - np.array([lie(t)[0] for t in path.time])
     local = off @ eye.rotation.T

@@ -75,7 +75,6 @@ def test_cleaning_keeps_colours_with_their_vertices() -> None:
     solid = primitives.box()
     colors = np.arange(24, dtype=np.uint8).reshape(8, 3)
     result = clean(Mesh(solid.vertices, solid.faces, colors))
-    assert result.colors is not None
     for vertex, color in zip(result.vertices, result.colors, strict=True):
         original = int(np.abs(solid.vertices - vertex).sum(1).argmin())
         assert (color == colors[original]).all()

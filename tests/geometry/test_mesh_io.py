@@ -77,7 +77,6 @@ def test_a_binary_ply_of_triangles_and_quads_is_read(tmp_path: Path, order: str,
     path.write_bytes(binary_ply(order, texcoords=texcoords))
     mesh = load_mesh(path)
     check_block(mesh)
-    assert mesh.colors is not None
     for vertex, color in zip(mesh.vertices, mesh.colors, strict=True):
         assert color.tolist() == [10 * PLACES.index(tuple(np.round(vertex).tolist())), 100, 200]
 

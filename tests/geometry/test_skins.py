@@ -46,7 +46,6 @@ def sides(image: Image.Image, *, repeats: float = 1.0) -> Any:
 
 def looked_at(mesh: Mesh, rows: np.ndarray) -> np.ndarray:
     """[F, R, 3] colours of a mesh's texture at barycentric places [R, 3] of each face."""
-    assert mesh.uv is not None and mesh.texture is not None
     at = np.einsum("rk,fkc->frc", rows, mesh.uv[mesh.faces]) * mesh.texture.shape[1::-1]
     x, y = np.moveaxis(at.astype(int), -1, 0)
     return mesh.texture[y, x].astype(int)
@@ -108,7 +107,6 @@ def test_parts_with_images_of_their_own_share_one_and_repeat_as_often_as_they_di
     two.apply_translation([3.0, 0.0, 0.0])
     trimesh.Scene([one, two]).export(tmp_path / "both.glb")
     skin = load_textured(tmp_path / "both.glb").skin
-    assert skin is not None
     rows = inside(30)
     got, x = looked_at(skin, rows), places(skin, rows)[..., 0]
     assert (got[x > 2.0][:, 0] < 30).all() and (got[x < 2.0][:, 2] < 30).all()
@@ -149,7 +147,6 @@ def wavefront_die(rows: str = "usemtl side {}", library: str = "mtllib die.mtl")
 
 def assert_six_colors(skin: Mesh | None) -> None:
     """Each side has its own colour, up to what JPEG changes."""
-    assert skin is not None
     rows = inside(5)
     got, points = looked_at(skin, rows).reshape(-1, 3), places(skin, rows).reshape(-1, 3)
     axis = np.abs(points).argmax(1)
@@ -182,7 +179,6 @@ def test_a_die_keeps_six_colours_wherever_they_come_from(tmp_path: Path, ending:
     assert len(loaded.mesh.vertices) == 8 and not [note for note in loaded.notes if "colour" in note]
     skin = loaded.skin
     if kind == "glb":  # back to y up
-        assert skin is not None
         skin = Mesh(skin.vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0], skin.faces, None, skin.uv, skin.texture)
     assert_six_colors(skin)
     shape = shape_from_mesh(file, tmp_path / "cache", sdf="grid", resolution=16)
@@ -284,7 +280,6 @@ def test_specular_and_glossiness_have_a_colour_too(tmp_path: Path) -> None:
         tree["materials"] = [{"extensions": {"KHR_materials_pbrSpecularGlossiness": diffuse}}]
 
     skin = load_textured(gltf_box(tmp_path, change)).skin
-    assert skin is not None
     got = looked_at(skin, inside(20)).reshape(-1, 3)
     assert got[:, 0].max() > 230 and (got[:, 1:] == 0).all() and (got[:, 0] > 128).mean() == pytest.approx(0.5, abs=0.1)
 
@@ -311,7 +306,6 @@ def test_a_texture_that_is_turned_lies_turned(tmp_path: Path) -> None:
         load_textured(gltf_box(tmp_path, change)).skin,
         load_textured(gltf_box(tmp_path, lambda tree: None)).skin,
     )
-    assert skin is not None and plain is not None and plain.uv is not None
     np.testing.assert_allclose(skin.uv, np.stack([plain.uv[:, 1], 1 - plain.uv[:, 0]], axis=1), atol=1e-6)
 
 

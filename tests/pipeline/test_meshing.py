@@ -323,7 +323,6 @@ def on_surface(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     second, third = found["primitive_uvs"].numpy().T
     weights = np.stack([1 - second - third, second, third], 1)
     if mesh.uv is None or mesh.texture is None:
-        assert mesh.colors is not None
         return (mesh.colors[corners] * weights[..., None]).sum(1)
     uv = (mesh.uv[corners] * weights[..., None]).sum(1)
     return bilinear(mesh.texture.astype(float), uv * mesh.texture.shape[1::-1] - 0.5)
@@ -437,7 +436,6 @@ def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path, monkeypat
 
 def test_recordings_show_the_texture(tmp_path):
     mesh = skin()
-    assert mesh.uv is not None and mesh.texture is not None
     save_reconstruction(tmp_path / "r.rrd", [], np.zeros((0, 3)), None, plate(2), {"scene": mesh, "object1": mesh})
     found = read(tmp_path / "r.rrd")
     assert "/world/surface!" not in found and "/world/surface/scene!" in found
@@ -617,7 +615,6 @@ def seen(mesh: Mesh, elevation: float, count: int = 12) -> Evidence:
 
 def told(mesh: Mesh, *evidence: Evidence) -> tuple[Hollow, str]:
     found = hollow(mesh, 0.01, *evidence)
-    assert found is not None
     return found, hollow_line("cup", found)
 
 

@@ -125,7 +125,6 @@ def test_the_few_pixels_that_see_past_a_surface_do_not_move_it(tmp_path):
     shoot(views, ball_on_plane, tmp_path)
     maps = with_far_pixels(exact(views, ball_on_plane), 0.05, 1.5)
     fused = fuse(maps, 48, tmp_path)
-    assert fused is not None
     turn = np.linspace(0, 2 * np.pi, 400)
     on = BALL * np.stack([0.8 * np.cos(turn), 0.8 * np.sin(turn), np.full(400, 0.6)], 1)
     assert abs(np.median(distance_at(fused, on))) < 0.05 * 2 / 47
@@ -148,7 +147,6 @@ def test_what_most_photos_see_past_is_empty(tmp_path):
             lid = np.linalg.norm(at[..., :2], axis=-1) < 0.2
             maps[number] = replace(one, inverse=np.where(lid, 1 / away, one.inverse).astype(np.float32))
         fused = fuse(maps, 48, tmp_path)
-        assert fused is not None
         return float(distance_at(fused, np.array([[0.0, 0.0, 0.34]]))[0])
 
     assert middle(4) > 0 and middle(8) < 0
@@ -164,7 +162,6 @@ def test_the_air_behind_a_thin_wall_is_empty(tmp_path):
     sure = exact(outer, pot)
     unsure = [replace(one, certain=0.04 * one.certain) for one in exact(inner, pot)]
     fused = fuse([*sure, *unsure], 48, tmp_path)
-    assert fused is not None
     turn, height = (part.ravel() for part in np.meshgrid(np.linspace(0, 2 * np.pi, 36), np.linspace(0.2, 0.42, 12)))
 
     def at(radius: float) -> np.ndarray:
@@ -198,7 +195,6 @@ def test_thin_solids_survive_noise(tmp_path):
         depth = 1 / np.where(known, one.inverse, 1) + wrong
         maps.append(replace(one, inverse=np.where(known, 1 / depth, 0).astype(np.float32)))
     fused = fuse(maps, 48, tmp_path)
-    assert fused is not None
     place = places_of(fused.bricks)
     points = place[:, ::-1] * cell / 2 - 1
     value, true = map_coordinates(fused.coarse, place.T / 2, order=1) + fused.fine, board_and_leg(points)
@@ -224,7 +220,6 @@ def test_the_inside_of_thick_bodies_is_solid_whatever_wrong_pixels_see(tmp_path)
     shoot(views, crate, tmp_path)
     maps = with_far_pixels(exact(views, crate), 0.01, 1.6)
     fused = fuse(maps, 48, tmp_path)
-    assert fused is not None
     line = np.linspace(-1, 1, 48)
     points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)[..., ::-1]
     assert (fused.coarse[np.abs(points).max(-1) < half - 2 / 47] < 0).all()

@@ -142,7 +142,6 @@ def test_up_from_the_dominant_plane():
         np.concatenate([points, clutter]), np.concatenate([np.repeat(normal[None], 800, 0), other]),
         np.ones(1200), np.array([0.0, 0, 1]), 0.02,
     )  # fmt: skip
-    assert found is not None
     assert np.degrees(np.arccos(found[0] @ normal)) < 0.5 and found[1] < 0.5
     assert plane_up(clutter, other, np.ones(400), np.array([0.0, 0, 1]), 0.005) is None
 

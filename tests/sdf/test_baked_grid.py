@@ -116,7 +116,6 @@ def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
     above = np.array([[0.5, 0.0, 0.15]])
     for known, want in ((pieces, 0.05), ((), -0.05), (pieces, 0.05)):
         grid = replace(bar, pieces=known).contact.grid
-        assert grid is not None
         np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
 
 

@@ -13,7 +13,6 @@ def descend(optimiser: Soap | torch.optim.Adam, parameters: list[torch.Tensor], 
     """Towards a quadratic's minimum."""
     for _ in range(steps):
         for parameter in parameters:
-            assert parameter.grad is not None
             parameter.grad.copy_(torch.linspace(0.1, 3.0, parameter.shape[-1]) * parameter + 0.3)
         optimiser.step(*factor)
 
