@@ -17,14 +17,10 @@ import cli
 import sdfsim
 from sdfsim import Camera, Simulator
 from sdfsim.apps.film.camera import Points, of_points, read_points
-from sdfsim.apps.film.drawing import Look
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.film import identify_clips, watched, with_moving
-from sdfsim.apps.film.frames import Clip, read_clip, true_times
-from sdfsim.apps.film.poses import Seen
+from sdfsim.apps.film.frames import read_clip, true_times
 from sdfsim.apps.film.room import of_room, photos_of
-from sdfsim.apps.film.supports import with_paths
-from sdfsim.apps.film.track import Track
 from sdfsim.apps.identify.filmed import persistence as persistence_of
 from sdfsim.apps.identify.report import write_scene
 from sdfsim.base.errors import SdfsimError
@@ -346,33 +342,6 @@ def test_static_bodies_that_are_named_are_moved_along():
         with_moving(scene, ["plnk"])
     with pytest.raises(SdfsimError, match="no body of the scene"):
         with_moving(scene, ["floor"])  # a plane has no outline
-
-
-def test_a_path_is_smooth_where_frames_are_not():
-    """Depth scatters by 20 mm from frame to frame, places across the picture by a tenth of a millimetre."""
-    rng, time = np.random.default_rng(0), np.arange(55) / 30
-    scene = with_moving(plank_scene().load(), ["plank"])
-    plank = scene.bodies[1]
-    turn = Rotation.from_euler("xyz", [100, 10, 20], degrees=True).as_matrix()
-    eye = Eye(turn, np.array([0.0, 0.0, 1.5]), 400.0, 320, 240, np.zeros((7, 0)))
-    seen: list[Seen | None] = []
-    for t in time:
-        place, q = lie(t)
-        ahead = (place + eye.rotation.T @ eye.translation) / 1.5
-        place = place + 0.02 * rng.standard_normal() * ahead + 1e-4 * rng.standard_normal(3)
-        seen.append(Seen(place, q.as_quat(), np.eye(6), np.zeros(6), np.zeros((6, 7)), np.zeros((1, 3)), 1.0, 1.0))
-    track = Track(Look(scene, plank), seen)
-    track.seen[7] = None
-    clip = Clip(Path("clip.mp4"), time + 3.0, np.zeros((55, 2, 2, 3), np.uint8))
-    path = with_paths(clip, eye, scene, [track]).bodies[1].path
-    assert len(path.time) == 54
-    off = path.position - np.array([lie(t)[0] for t in path.time])
-    local = off @ eye.rotation.T
-    assert np.abs(local[:, 2]).max() < 0.02
-    assert np.sqrt(np.square(local[:, 2]).mean()) < 0.009  # of 20 mm
-    assert np.sqrt(np.square(local[:, :2]).mean()) < 0.002
-    jerk = np.diff(path.position, 2, axis=0) * 900
-    assert np.abs(jerk).max() < 5.0  # m/s^2; the raw poses have 50
 
 
 SIZE = 320, 240

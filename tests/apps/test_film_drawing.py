@@ -71,15 +71,3 @@ def test_a_mesh_covers_what_rays_hit(tmp_path):
     assert np.abs(found - wanted).max() < 0.3  # 16 places in a pixel
     assert np.abs(found - wanted).mean() < 0.01
     assert found.sum() == pytest.approx(wanted.sum(), rel=0.005)
-
-
-def test_a_box_covers_the_same_by_its_faces_and_by_a_depth_buffer():
-    scene = Scene(model="solver").add("floor", plane={}).add("box", box={"size": [0.1, 0.07, 0.12]}, mass=1).load()
-    look, turn = Look(scene, scene.bodies[1]), np.array([0.1, 0.2, 0.3, 0.9]) / np.sqrt(0.95)
-    at = look.window(EYE, np.zeros(3), turn, 6.0)
-    exact = look.cover(EYE, np.zeros(3), turn, at)
-    assert len(look.faces) == len(exact) == 6
-    look.faces = []
-    places = look.cover(EYE, np.zeros(3), turn, at)
-    assert np.abs(exact.sum((1, 2)) - places.sum((1, 2))).max() < 0.01 * exact.sum()
-    assert np.abs(exact - places).max() < 0.3

@@ -1,7 +1,6 @@
 """The contact solve as a simulator's model: scaling, places, sleep, going on after a kill, crowds."""
 
 import pickle
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -34,39 +33,6 @@ def heap(seed: int, count: int = 6, weight: float = 9.81) -> Scene:
         )  # fmt: skip
     floor = body("floor", 3, [0, 0, 0], 0.0, motion="static", friction=0.8, restitution=1.0)
     return Scene(shapes, (*bodies, floor), np.array([0.0, 0.0, -weight]), 1.0)
-
-
-@pytest.mark.parametrize("ratio", [10.0, 100.0])
-def test_contacts_bear_the_weights_of_a_heavy_cube_on_a_light_one(ratio):
-    bodies = [body(str(k), 0, [0, 0, k + 0.5], m) for k, m in enumerate((1.0, ratio))]
-    bodies.append(body("floor", 1, [0, 0, 0], 0.0, motion="static"))
-    sim = Simulator(Scene((cube(1.0), analytic_shape("plane")), tuple(bodies), np.array([0, 0, -9.81]), 1.0), "solver")
-    sim.options = sim.options._replace(sleep=False)
-    sim.run(3.0)
-    touch, inner = sim.state.touch, sim.options.dt / sim.options.substeps
-    weight, gravity = np.zeros(3), np.linalg.norm(sim.options.gravity)
-    for pair, count, point in zip(touch.pair, touch.count, touch.point, strict=True):
-        weight[pair[1]] += point[:count, 10].sum() / inner / gravity
-    masses = sim.bodies.mass
-    assert weight[1:] == pytest.approx([masses[1], masses.sum()], rel=0.02)
-
-
-def test_what_rests_sleeps_and_wakes_when_it_is_hit_or_changed():
-    boxes = [body(str(k), 0, [0, 0, k + 0.5]) for k in range(3)]
-    far = body("ball", 1, [0, 0, 40.0])
-    floor = body("floor", 2, [0, 0, 0], 0.0, motion="static")
-    scene = Scene((cube(1.0), ball(1.0), analytic_shape("plane")), (*boxes, far, floor), np.array([0, 0, -9.81]), 4.0)
-    sim = Simulator(scene, "solver")
-    motion = sim.run(2.0)
-    assert motion.counters["asleep"][-1] == 3
-    assert (motion.position[-1, :3] == motion.position[-10, :3]).all() and not motion.velocity[-1, :3].any()
-    kept, velocity = sim.state, sim.state.velocity.copy()
-    velocity[1] = 0.5
-    sim.state = replace(kept, velocity=velocity)
-    assert sim.run(steps=1).counters["asleep"][-1] == 0
-    sim.state = kept
-    hit = sim.run(1.5)
-    assert hit.counters["asleep"].min() == 0  # the ball comes down on them
 
 
 def test_effects_that_are_off_do_not_act():

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from numba import njit
 
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics.solver.prepare import _planted
-from sdfsim.physics.solver.triangles import lowest_corner, signed_distances
+from sdfsim.physics.solver.triangles import signed_distances
 from sdfsim.shape.triangle_tree import triangle_tree
 
 
@@ -46,28 +45,6 @@ def test_the_nearest_point_is_that_of_another_library_and_so_is_the_side(name: s
     inside = solid_angle.sum(1) > 2.0 * np.pi
     clear = np.abs(found) > 1e-9
     assert ((found < 0.0) == inside)[clear].all()
-
-
-@njit
-def lowest(tree, start, up, radius, slope):
-    return lowest_corner(tree, 0, start, up, radius, slope)
-
-
-@pytest.mark.parametrize("name", ["torus", "gear", "bowl"])
-def test_the_lowest_corner_is_that_of_all_corners_tried_one_by_one(name: str) -> None:
-    mesh, rng, moved = primitives.PRIMITIVES[name](), np.random.default_rng(4), 0
-    tree, corners = _planted([triangle_tree(mesh)]), mesh.vertices[np.unique(mesh.faces)]
-    for _ in range(100):
-        start, up = corners[rng.integers(len(corners))] + rng.normal(size=3) * 0.01, rng.normal(size=3)
-        up /= np.linalg.norm(up)
-        radius, slope = rng.uniform(0.02, 0.3), rng.uniform(0.1, 1.0)
-        found = lowest(tree, tuple(start), tuple(up), radius, slope)
-        way = corners - start
-        away, drop = np.linalg.norm(way, axis=1), -way @ up
-        drop = drop[(drop > 0.0) & (away < radius) & (drop <= slope * away)].max(initial=0.0)
-        assert up @ (start - found) == pytest.approx(drop, abs=1e-12)
-        moved += drop > 0.0
-    assert moved > 20
 
 
 def test_what_is_farther_than_asked_is_not_found() -> None:

@@ -19,7 +19,6 @@ from pipeline.field.grid_field import (
     sample_weights,
     stencil,
 )
-from pipeline.field.rendering import choose_samples
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import (
     BACKGROUND_RATE,
@@ -63,26 +62,11 @@ def test_a_wall_shows_where_it_is():
         assert left.item() == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_ray_that_starts_inside_sees_its_first_sample():
-    weights, left = sample_weights(torch.tensor([[-0.5, -0.4, 0.3, 0.4]], dtype=torch.float64), 0.01)
-    assert weights[0, 0].item() == pytest.approx(1.0, abs=1e-6) and left.item() == pytest.approx(0.0, abs=1e-6)
-
-
 def test_differences_on_a_quadratic():
     p = torch.randn(20, 3, dtype=torch.float64)
     values = (stencil(p, 0.01) ** 2).sum(-1)
     gradient, laplacian = differences(values, 0.01)
     assert torch.allclose(gradient, 2 * p) and torch.allclose(laplacian, torch.full_like(laplacian, 6.0), atol=1e-8)
-
-
-def test_samples_gather_at_the_surface():
-    line = torch.linspace(-1, 1, 64)
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    cache = (torch.stack([x, y, z]).norm(dim=0) - 0.5)[..., None]
-    origin, direction = torch.tensor([[0.0, 0, -3]]), torch.tensor([[0.0, 0, 1]])
-    found = choose_samples(cache, origin, direction, 0.01, torch.full((1, 32), 0.5))
-    assert (found.distance.diff() >= 0).all()
-    assert (found.points[found.near_surface].norm(dim=1) - 0.5).abs().median() < 0.05
 
 
 def test_camera_rays_match_the_slow_twin_and_projection():
@@ -270,14 +254,6 @@ def test_threads_change_nothing():
         torch.set_num_threads(before)
     for one, two in zip(found[1], found[2], strict=True):
         assert torch.equal(one, two)
-
-
-def test_nothing_asked_is_nothing_found():
-    grid = torch.ones(4, 4, 4, 3, requires_grad=True)
-    found = interpolate(grid, torch.zeros(0, 3))
-    assert found.shape == (0, 3)
-    found.sum().backward()
-    assert grid.grad is not None and not grid.grad.any()
 
 
 def looks_into_a_room(count: int, cameras: Tensor, rng: torch.Generator) -> tuple[Tensor, Tensor, Tensor]:

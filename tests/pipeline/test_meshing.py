@@ -16,7 +16,7 @@ from PIL import Image
 from pipeline.cameras import Similarity, Sparse, View, load_views, save_views
 from pipeline.field.training import Trained
 from pipeline.inputs.photos import Photo, save_photos
-from pipeline.mesh import meshing, photo_refining, texture
+from pipeline.mesh import meshing, photo_refining
 from pipeline.mesh.extraction import sample_box
 from pipeline.mesh.hollows import Hollow, hollow, hollow_line
 from pipeline.mesh.meshing import make_meshes, read_parts, trust_meshes
@@ -422,16 +422,6 @@ def test_the_skin_of_a_body_stands_at_the_bodys_origin(tmp_path):
     skins = skins_of(tmp_path)
     assert np.allclose(skins["scenery"].vertices, flat.vertices, atol=1e-6)
     assert np.allclose(skins["object1"].vertices, flat.vertices - [0.3, 0.4, 0.4], atol=1e-6)
-
-
-def test_the_best_view_gives_a_sharper_texture_than_the_mean(tmp_path, monkeypatch):
-    """Where the mesh is off by a little, the photos do not agree."""
-    true, mesh = plate(1), plate(20, z=0.012)
-    shots = photograph(tmp_path, round_about(1.2), [true], [pattern])
-    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.012], [0.3, 0.3, 0.012], (4000, 3))
-    best = on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
-    monkeypatch.setattr(texture, "POWER", 1.0)
-    assert best > 1.2 * on_surface(textured(in_colors(mesh, shots), shots), points)[:, :2].std()
 
 
 def test_recordings_show_the_texture(tmp_path):

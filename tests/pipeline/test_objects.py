@@ -19,7 +19,6 @@ from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.placement import located_bodies
-from pipeline.mesh.seams import Seam, flood, solid_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.geometry.bvh import Caster, Winding
@@ -462,24 +461,6 @@ def test_what_masks_name_is_cut_off_a_wall_too(tmp_path):
     found = scene.split(tmp_path / "p", ("shelf",))
     assert list(found.bodies) == ["shelf"] and found.solid is not None and is_closed(found.solid)
     scene.check(found, {"shelf": "shelf"}, CELL, 0.05)
-
-
-def test_no_pocket_of_one_body_stays_within_another():
-    """A crate on a crate, with a hole in the lower one that no photo sees; its wall was taken for the upper one."""
-    cell = 1 / 16
-    line = np.arange(-1, 1 + cell / 2, cell)
-    points = np.stack(np.meshgrid(line, line, line, indexing="ij"), -1)
-    crates = np.abs(points).max(-1) - 0.75
-    hole = np.array([0.0, 0.0, -0.4])
-    volume = Volume(np.maximum(crates, 0.2 - np.linalg.norm(points - hole, axis=-1)), np.full(3, -1.0), cell)
-    solid = solid_of(volume, volume.values < 0, volume.mesh())
-    upper = (solid.points[:, 2] > 0) | (np.linalg.norm(solid.points - hole, axis=1) < 0.3)
-    square = 0.75 * np.array([[1.0, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
-    sides = np.array([[1.0, 0, -0.75], [-1, 0, -0.75], [0, 1, -0.75], [0, -1, -0.75]])
-    seam = Seam((0, 1), square, np.zeros(3), np.array([0.0, 0, 1]), True, sides)
-    part = flood(solid, upper.astype(int), [seam])
-    assert set(np.unique(part[points[..., 2] < -2 * cell])) == {-1, 0}
-    assert set(np.unique(part[points[..., 2] > 2 * cell])) == {-1, 1}
 
 
 def mug(make) -> tuple[list, list[str]]:

@@ -1,6 +1,5 @@
 """Where the field is asked: drawn samples, free space that photos prove, and the cached SDF."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,13 +12,10 @@ from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import (
     GAP,
     NOISES,
-    STEREO_POINTS,
     DepthPoints,
     FreeSpace,
-    stereo_points,
     supervision_of,
 )
-from pipeline.stereo.depth import DepthMap
 from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
@@ -70,19 +66,6 @@ def test_lines_of_sight_through_a_fused_solid_are_left_out():
     passed = np.linalg.norm(found.sight[3:, 3:], axis=1)
     np.testing.assert_allclose(passed, 0.4 + GAP * CELL, atol=1e-9)
     np.testing.assert_array_equal(found.depth, every.depth)
-
-
-def test_points_of_stereo_are_those_that_are_certain():
-    """Of a photo with more than are used. Half the certainty makes half of the points, less than 0.3 none."""
-    view = replace(ring(4)[0], width=400, height=400)
-    certain = np.full((400, 400), 0.4, np.float32)
-    certain[:, 200:], certain[:100] = 0.8, 0.2
-    matrix = np.array([[200.0, 0, 199.5], [0, 200, 199.5], [0, 0, 1]])
-    one = DepthMap(view, matrix, np.full((400, 400), 0.5, np.float32), certain)
-    found = stereo_points([one], PosedPhotos((view,), NOTHING.sparse)).xyz
-    right, below = (found @ view.rotation.T + view.translation)[:, :2].T > [[0], [-1]]
-    assert len(found) == STEREO_POINTS and len(np.unique(found, axis=0)) == STEREO_POINTS
-    assert right.mean() == pytest.approx(2 / 3, abs=0.03) and below.all()
 
 
 @pytest.mark.parametrize("slope", [0.5, 1.0, 1.35])

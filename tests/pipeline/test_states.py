@@ -18,9 +18,7 @@ from typer.testing import CliRunner
 import cli
 from pipeline.cameras import Similarity, View
 from pipeline.clearing import Cleared
-from pipeline.mesh.bodies import Parts
 from pipeline.mesh.joint import PART, Doubt, FoundJoint, HeldPart, find_joint, load_held, scene_keys
-from pipeline.mesh.meshing import axis_ends
 from pipeline.mesh.moving_part import State, tied
 from pipeline.mesh.placement import Placement
 from pipeline.mesh.visibility import Visibility
@@ -180,18 +178,6 @@ def test_what_is_beside_the_part_holds_it():
               "object2": box((0.8, 0, 0), (1, 1, 1))}  # fmt: skip
     assert holder_of(part, others) == "object1"
     assert holder_of(part, {}) is None
-
-
-def test_the_picture_of_names_shows_the_axis_along_the_part_and_the_way_of_a_slider():
-    """The part hangs on the hinge at x = 0.3 in its second state; along the axis it goes from 0 to 0.6."""
-    part = Mesh(np.array([[0.3, 0, 0], [0.3, 0, 0.6], [0.1, 0.35, 0.6]]), np.array([[0, 1, 2]]))
-    parts = Parts(None, None, {PART: part}, 0.0)
-    along = axis_ends(parts, HELD)
-    assert along is not None and np.allclose(along, [[0.3, 0, 0], [0.3, 0, 0.6]])
-    slides = replace(HELD, kind="slider", travel=0.2, turn=np.eye(3), shift=np.array([0, 0, -0.2]))
-    ends = axis_ends(parts, slides)
-    assert ends is not None and np.allclose(ends, [[0.3, 0, 0.4], [0.3, 0, 0.6]])
-    assert axis_ends(parts, None) is None and axis_ends(Parts(None, None, {}, 0.0), HELD) is None
 
 
 def test_photos_that_lie_where_results_go_are_refused(tmp_path):

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from pipeline.cameras import PosedPhotos, View
 from pipeline.grids.interpolation import places_of
-from pipeline.stereo.depth import BEYOND, DepthMap, outside_mask, stereo, stereo_summary
+from pipeline.stereo.depth import BEYOND, DepthMap, outside_mask, stereo
 from pipeline.stereo.fusion import Fused, fuse
 from tests.helpers.balls import BALL, Distance, ball_on_plane, camera, cup, grey_of, ring, shoot, true_depth
 
@@ -61,13 +61,6 @@ def test_depth_in_a_narrow_mouth_is_that_of_what_lies_in_it(tmp_path, monkeypatc
         inside += deep.sum()
         right += (deep & (np.abs(along / np.where(one.inverse > 0, one.inverse, 1e9) / true - 1) < 0.01)).sum()
     assert inside > 5000 and right / inside > 0.38
-
-
-def test_the_report_says_how_much_was_seen_and_how_exactly(scene):
-    poses, maps = scene
-    found = stereo_summary(maps, poses)
-    assert found["valid"] == pytest.approx(np.mean([(one.inverse > 0).mean() for one in maps]), abs=1e-3)
-    assert 0 < found["spread"] < 0.006
 
 
 def test_fused_depth_is_the_signed_distance(scene, folder):

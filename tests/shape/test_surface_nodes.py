@@ -7,7 +7,7 @@ from sdfsim.geometry.mesh import Mesh, joined, sample_surface
 from sdfsim.geometry.solidify import solidify
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 from sdfsim.sdf.mesh_sdf import MeshSdf
-from sdfsim.shape.surface_nodes import _reaching, edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
+from sdfsim.shape.surface_nodes import edge_nodes, hull_nodes, sample_nodes, surface_nodes, thin
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
@@ -96,21 +96,6 @@ def test_nodes_reach_as_far_as_a_vase_does_in_every_direction() -> None:
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     short = (direction @ mesh.vertices.T).max(1) - (direction @ nodes.T).max(1)
     assert short.max() < 0.006 and short.mean() < 0.0006
-
-
-def test_of_a_box_the_corners_reach_farthest_and_nothing_else() -> None:
-    import trimesh
-
-    box = trimesh.creation.box((1.0, 0.6, 0.4)).subdivide().subdivide()
-    corners = _reaching(box.vertices, 170)
-    assert len(np.unique(corners, axis=0)) == len(corners) == 8
-    np.testing.assert_allclose(np.abs(corners) - [0.5, 0.3, 0.2], 0.0, atol=1e-12)
-
-
-def test_of_a_flat_sheet_its_rim_reaches_farthest() -> None:
-    x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
-    corners = _reaching(np.stack([x, y, 0 * x], -1).reshape(-1, 3), 170)
-    assert len(corners) == 4 and (np.abs(corners[:, :2]) == 1.0).all()
 
 
 def test_nodes_of_boxes_that_cross_lie_on_their_union():
