@@ -11,11 +11,6 @@ from numba.core import config
 
 from sdfsim.base import compiling
 from sdfsim.base.compiling import compile_before, is_compiled
-from sdfsim.physics.solver import prepare as solver
-from sdfsim.scene.scene import Joint, Scene
-from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate.simulator import Simulator
-from tests.helpers.scenes import make_body
 
 SOURCE = "from numba import njit\n\n\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
 
@@ -40,25 +35,6 @@ def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, cap
     assert caplog.messages == ["compiling doubling, once for this version: about 20 s"]
     assert is_compiled(double) == (cache == "True") and double(3) == 6
     assert (sum(double.stats.cache_hits.values()), len(double.stats.cache_misses)) == (1, 0) or cache == "False"
-
-
-def test_a_scene_compiles_the_pieces_that_it_needs(monkeypatch):
-    def asked(jobs, what):
-        names.append({function.py_func.__name__ for function, _ in jobs} - {"run_steps"})
-        raise InterruptedError
-
-    names: list[set[str]] = []
-    monkeypatch.setattr(solver, "compile_before", asked)
-    balls = [make_body(f"ball {k}", 0, [3 * k, 0, 1]) for k in range(solver.CROWD)]
-    pin = Joint("pin", "ball", (0, 1), np.array([[1.5, 0, 0], [-1.5, 0, 0]]), np.array([[0.0, 0, 0, 1]] * 2))
-    for bodies, joints in ((balls[:2], ()), (balls[:2], (pin,)), (balls, ())):
-        scene = Scene((analytic_shape("sphere", radius=0.5),), tuple(bodies), np.zeros(3), 1.0, joints=joints)
-        with pytest.raises(InterruptedError):
-            Simulator(scene, "solver").step()
-    few, jointed, many = names
-    assert few == {"near_solids", "collide_solids", "impact_solids", "solve_contacts"}
-    assert jointed == few - {"solve_contacts"} | {"solve_joints", "assemble"}
-    assert many == {"near_many", "collide_many", "impact_surfaces", "solve_many"}
 
 
 def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):

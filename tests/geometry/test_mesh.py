@@ -6,7 +6,7 @@ import pytest
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mass import mass_properties, mass_properties_of_sdf
-from sdfsim.geometry.mesh import Mesh, clean, is_closed, sample_surface, signed_volume
+from sdfsim.geometry.mesh import Mesh, clean, is_closed, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh, load_pieces, write_ply
 from sdfsim.sdf.closed_forms import BoxSdf, SphereSdf
 
@@ -102,14 +102,6 @@ def test_grid_integrals_agree_with_closed_forms(sdf, volume: float, inertia) -> 
     assert got == pytest.approx(volume, rel=5e-3)
     np.testing.assert_allclose(com, 0, atol=1e-9)
     np.testing.assert_allclose(moment, volume * np.diag(inertia), rtol=1e-2, atol=1e-9)
-
-
-def test_surface_samples_lie_on_faces_in_proportion_to_area() -> None:
-    points, normals = sample_surface(primitives.box((1.0, 1.0, 4.0)), 20_000, np.random.default_rng(0))
-    half = np.array([0.5, 0.5, 2.0])
-    np.testing.assert_allclose(np.abs(np.abs(points) - half).min(1), 0, atol=1e-12)
-    assert (np.einsum("pi,pi->p", points, normals) > 0).all()
-    assert np.mean(np.abs(normals[:, 2]) > 0.5) == pytest.approx(2 / 18, abs=0.01)
 
 
 def test_pieces_are_the_hulls_of_the_groups(tmp_path: Path) -> None:

@@ -4,40 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from sdfsim.learned.surfaces import advance, node_owner
-from sdfsim.learned.tensors import state_arrays
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
-from tests.helpers.scenes import angle_between, in_torch, make_body, random_model, surface_model
-
-
-def test_without_acceleration_every_body_goes_on_as_it_came(dropped):
-    """Zero acceleration of every node is uniform motion: translation exactly, rotation to the order of the step."""
-    sim = Simulator(dropped, surface_model())
-    zero = torch.zeros(len(sim.bodies.node), 3, dtype=torch.float64)
-    after = state_arrays(advance(*in_torch(sim.bodies, sim.state), zero, sim.options.dt))
-    moves = sim.bodies.moves
-    before = sim.state.earlier_position[1]
-    np.testing.assert_allclose(
-        after.position[moves], (2 * sim.state.position - before)[moves], rtol=0, atol=2e-3 * sim.options.dt
-    )
-    np.testing.assert_array_equal(after.position[~moves], sim.state.position[~moves])
-
-
-def test_a_common_acceleration_moves_the_centre_by_it(free_pair):
-    sim = Simulator(free_pair, surface_model())
-    push = torch.tensor([[0.01, -0.02, 0.03], [0.0, 0.05, 0.0]], dtype=torch.float64)
-    bodies, state = in_torch(sim.bodies, sim.state)
-    owner = node_owner(bodies)
-    with_push, without = (
-        state_arrays(advance(bodies, state, acceleration[owner], sim.options.dt))
-        for acceleration in (push, torch.zeros_like(push))
-    )
-    np.testing.assert_allclose(with_push.position - without.position, push, rtol=0, atol=1e-9)
-    assert angle_between(with_push.orientation, without.orientation).max() < 1e-6
+from tests.helpers.scenes import make_body, random_model, surface_model
 
 
 def test_exact_free_flight_leaves_the_high_body_to_gravity_and_learned_does_not(dropped):

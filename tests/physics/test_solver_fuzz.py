@@ -7,12 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, Simulator
-from sdfsim.learned import inference
 from sdfsim.physics.free_flight import torque_free
 from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, load_shape
-from tests.helpers.scenes import angle_between, random_model
+from tests.helpers.scenes import angle_between
 from tests.helpers.scenes import make_body as body
 from tests.helpers.shapes import SHAPES
 
@@ -190,11 +189,3 @@ def test_a_rotation_in_single_precision_is_one_in_double_after_a_step():
     after, _ = torque_free(long, w, TOP, 0.02)
     assert abs(np.linalg.norm(after) - 1.0) < 1e-15
     assert angle_between(after, torque_free(q, w, TOP, 0.02)[0]).max() < 1e-7
-
-
-def test_a_scene_without_contacts_never_calls_the_network(dropped, monkeypatch):
-    model = random_model("impulse")
-    monkeypatch.setattr(inference, "stepped", lambda *a, **k: (_ for _ in ()).throw(AssertionError("network called")))
-    high = Scene(dropped.shapes, (dropped.bodies[0], dropped.bodies[3]), dropped.gravity, 1.0)
-    rollout = Simulator(high, model).run(seconds=1.0)
-    assert (rollout.contact_count == 0).all()

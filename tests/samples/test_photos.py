@@ -70,18 +70,6 @@ def test_a_ball_falls_as_far_into_the_vase_as_that_is_hollow(tmp_path, kind):
     assert found["aside_cm"] < 4
 
 
-def test_floors_of_what_is_turned_have_rings_not_rays_alone():
-    """The texture's rows say which of them is shown: outside the height, on a floor more the farther from the axis."""
-    rows = np.broadcast_to((np.arange(900) / 1000)[:, None, None], (900, 1000, 3)).astype(np.float32)
-    part = make.Part(np.zeros((1, 3)), np.zeros((0, 3), int), rows, "turned", make.LATHE_TEXEL, (0.0, 0.0, 0.0))
-    away, up = np.linspace(0.01, 0.05, 5), np.array([0.0, 0.0, 1.0])
-    floor = make.sample_texture(part, np.column_stack([away, 0 * away, 0 * away + 0.02]), np.tile(up, (5, 1)))
-    wanted = (make.INSIDE + make.DOWN * (away + 0.02)) / make.LATHE_TEXEL / 1000
-    np.testing.assert_allclose(floor, np.repeat(wanted[:, None], 3, 1), atol=1e-4)
-    wall = make.sample_texture(part, np.array([[0.1, 0.0, 0.08]]), np.array([[1.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(wall, 0.08 / make.LATHE_TEXEL / 1000, atol=1e-4)
-
-
 SCRIPT = Path(__file__).resolve().parents[2] / "samples" / "knock.py"
 
 

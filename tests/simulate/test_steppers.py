@@ -10,7 +10,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.validity import FARTHEST, FASTEST
-from sdfsim.scene.scene import Effects, Scene, Waypoints
+from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.helpers.scenes import make_body, random_model, surface_model
@@ -34,17 +34,6 @@ def resting() -> Simulator:
     sim.step(60)
     assert sim["box"].asleep and sim["other"].asleep
     return sim
-
-
-@pytest.mark.parametrize("contact", ["auto", "off"])
-@pytest.mark.parametrize("kind", MODELS)
-def test_steps_in_one_call_are_the_steps_one_by_one(dropped, kind, contact):
-    sim = Simulator(replace(dropped, effects=Effects(contact=contact)), MODELS[kind]())
-    made = sim.stepper.advance(sim.state, sim.stepper.init(sim.bodies, sim.state, sim.options), 6)
-    sim.step(6)
-    for name in NAMES:
-        np.testing.assert_array_equal(getattr(made.state, name), getattr(sim.state, name), err_msg=name)
-    assert made.counts["active"] == sim.carry.counts["active"]
 
 
 def busy() -> Scene:

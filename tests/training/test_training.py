@@ -18,7 +18,6 @@ from sdfsim.learned.model import load_model
 from sdfsim.physics.bodies import Units
 from sdfsim.physics.free_flight import fly
 from sdfsim.physics.options import Options
-from sdfsim.physics.solver import prepare
 from sdfsim.physics.solver.prepare import Compiled, points_near
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
@@ -148,17 +147,6 @@ def test_an_unreadable_frame_cache_is_named(ball_data):
     cached.write_bytes(content)
 
 
-def test_joined_frames_are_the_frames_of_both(ball_data):
-    one, two = (contact_frames(ball_data, split, ONCE) for split in ("train", "validation"))
-    joined = join_frames([one, two])
-    assert len(joined) == len(one) + len(two)
-    task, alone = ImpulseTask(joined), ImpulseTask(two)
-    for k in (0, len(two) - 1):
-        ours, theirs = task.batch(np.array([len(one) + k])), alone.batch(np.array([k]))
-        for name in ("velocity", "gap", "arm_second", "first"):
-            torch.testing.assert_close(getattr(ours.graph, name), getattr(theirs.graph, name), rtol=0, atol=0)
-
-
 def test_frames_of_another_gravity_cannot_be_joined(ball_data):
     frames = contact_frames(ball_data, "train", ONCE)
     with pytest.raises(SdfsimError, match="gravity"):
@@ -283,21 +271,6 @@ def tensors(value):
     if hasattr(value, "__dataclass_fields__"):
         return [found for field in fields(value) for found in tensors(getattr(value, field.name))]
     return []
-
-
-def test_shapes_are_compiled_once_for_all_batches(ball_data, monkeypatch):
-    made = []
-    known = prepare.compiled_shapes
-
-    def counted(shapes, **how):
-        made.append(shapes)
-        return known(shapes, **how)
-
-    monkeypatch.setattr(prepare, "compiled_shapes", counted)
-    task = SurfaceTask(ball_data, "train", PRESETS["sdf-sim"])
-    for step in range(5):
-        task.draw(np.random.default_rng(step), 4)
-    assert len(made) == 1
 
 
 def test_a_batch_moves_with_all_its_parts(ball_data):
