@@ -14,7 +14,6 @@ from pipeline.field.grid_field import (
     BACKGROUND_SAMPLES,
     Background,
     FieldSize,
-    GridField,
     differences,
     sample_weights,
     stencil,
@@ -207,23 +206,6 @@ def ball_fused(side: int = 24) -> Fused:
     rest = true - map_coordinates(coarse, place.T / 2, order=1, mode="nearest")
     color = np.broadcast_to(np.float32([0.8, 0.5, 0.2]), (len(place), 3))
     return Fused(coarse.astype(np.float32), 2 * side - 1, bricks, rest.astype(np.float32), color)
-
-
-def test_training_starts_from_fused_depth_and_half_a_cell_finer_than_without_bricks():
-    size = FieldSize((8, 24), (2, 2), 16, 8, (2,), (2,))
-    fused = ball_fused()
-    field = GridField(size, 0, fused=fused)
-    rng = torch.Generator().manual_seed(0)
-    points = torch.randn(4000, 3, generator=rng)
-    points = points / points.norm(dim=1, keepdim=True) * (0.5 + 0.02 * torch.randn(4000, 1, generator=rng))
-    with torch.no_grad():
-        off = (field.start_of(points)[0] - (points.norm(dim=1) - 0.5)).abs().mean()
-        rough = (interpolate(field.start, points)[:, 0] - (points.norm(dim=1) - 0.5)).abs().mean()
-        assert (field.sdf(points) - field.start_of(points)[0]).abs().mean() < 0.005
-        _, geometry, features = field.geometry_at(points)
-        color = field.color_of(geometry, features, points)
-    np.testing.assert_allclose(color.mean(0), [0.8, 0.5, 0.2], atol=0.02)
-    assert off < 0.35 * rough  # the error of linear interpolation goes with the square of the cell
 
 
 @pytest.mark.parametrize("killed", [10, 18])

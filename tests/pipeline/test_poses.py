@@ -15,7 +15,7 @@ from pipeline.sfm import poses, worker
 from pipeline.sfm.agreement import agreement, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
-from pipeline.sfm.worker import turn_only, zooms_of
+from pipeline.sfm.worker import zooms_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
 from tests.helpers.photos import photo, result, turned
@@ -360,22 +360,6 @@ def test_zooms_are_reported_apart_by_the_focal_lengths_of_each_photo_alone():
     assert zooms_of([*"ace"], focals) == [["c", "a", "e"]] and zooms_of(["f"], focals) == [["f"]]
 
 
-def test_turning_on_the_spot_is_reported_from_walking():
-    rng = np.random.default_rng(0)
-    size = {"width": 640, "height": 480}
-    directions = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (300, 3))
-    turn = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
-
-    def seen(points: np.ndarray) -> np.ndarray:
-        return 600 * points[:, :2] / points[:, 2:] + [320, 240]
-
-    turned = (size, seen(directions), seen(directions @ turn.T) + rng.normal(0, 0.5, (300, 2)))
-    deep = directions * rng.uniform(1, 4, (300, 1))
-    walked = (size, seen(deep), seen(deep + np.array([0.4, 0, 0])))
-    assert turn_only([turned, turned, walked]) == pytest.approx(2 / 3)
-    assert turn_only([walked]) == 0.0
-
-
 def zoomed(folder: Path, count: int, zooms: dict[int, float]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Writes `count` photos of the bundled set, without EXIF, of which every so manyth is cropped to its middle and
     enlarged again; returns the true focal lengths and camera centres by file name."""
@@ -412,39 +396,6 @@ def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
     assert move
     off = np.linalg.norm(move.scale * found @ move.rotation.matrix().T + move.translation - true, axis=1)
     assert off.max() < 0.01 * np.linalg.norm(true - true.mean(0), axis=1).mean()
-
-
-def write_features(database: Path, groups: list[int], shared: int) -> None:
-    """A database of photos that belong to groups: of each photo's 60 features as many are `shared` by its group."""
-    import pycolmap
-
-    rng = np.random.default_rng(0)
-    common = {group: rng.integers(0, 256, (shared, 128)) for group in set(groups)}
-    with pycolmap.Database.open(database) as opened:
-        camera = opened.write_camera(
-            pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=64, params=[60, 32, 32, 0])
-        )
-        for number, group in enumerate(groups):
-            image = opened.write_image(pycolmap.Image(name=f"{number}.jpg", camera_id=camera))
-            found = np.concatenate([common[group], rng.integers(0, 256, (60 - shared, 128))])
-            noise = rng.integers(-4, 5, found.shape)
-            places = np.column_stack([rng.random((60, 2)), np.full(60, 2.0), np.zeros((60, 2)), np.full(60, 2.0)])
-            opened.write_keypoints(image, places.astype(np.float32))
-            data = np.clip(found + noise, 0, 255).astype(np.uint8)
-            kind = pycolmap.FeatureExtractorType.SIFT
-            opened.write_descriptors(image, pycolmap.FeatureDescriptors(type=kind, data=data))
-
-
-def test_photos_are_paired_with_those_that_have_most_in_common(tmp_path):
-    import pycolmap
-
-    write_features(tmp_path / "database.db", [0, 1, 0, 1, 0, 1, 2], 30)
-    pairs = worker.alike(pycolmap, {"partners": 3}, tmp_path / "database.db")
-    assert sorted(pairs) == [
-        ("0.jpg", "2.jpg"), ("0.jpg", "4.jpg"), ("1.jpg", "3.jpg"), ("1.jpg", "5.jpg"), ("2.jpg", "4.jpg"),
-        ("3.jpg", "5.jpg"),
-    ]  # fmt: skip
-    assert len(worker.alike(pycolmap, {"partners": 1}, tmp_path / "database.db")) < 6
 
 
 @pytest.mark.parametrize(("still", "found"), [(12, [0.0625, 0.0833, 0.2083, 0.1667]), (0, []), (400, [])])
