@@ -1,15 +1,21 @@
-"""The field's formulas against closed forms, and the trainer's determinism."""
+"""Fields: formulas against closed forms, free space that photos prove, and training as a whole: determinism, held-out
+photos, budgets and resuming, and hollows that photos see into."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
-from pipeline.cameras import View
+from pipeline.cameras import PosedPhotos, Sparse, View
+from pipeline.field import supervision, training
+from pipeline.field.exposure import Exposure
 from pipeline.field.grid_field import (
     BACKGROUND_SAMPLES,
     Background,
@@ -18,19 +24,28 @@ from pipeline.field.grid_field import (
     sample_weights,
     stencil,
 )
+from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import supervision_of
 from pipeline.field.training import (
     BACKGROUND_RATE,
+    FEWEST_STEPS,
+    HELD_OUT,
     PRESETS,
     Trainer,
     camera_rays,
+    compare,
     load_rays,
+    score,
     train,
 )
 from pipeline.grids.interpolation import WHOLE, by_rows, interpolate, interpolate_bricks, near_bricks, places_of
+from pipeline.inputs.photos import save_photos
+from pipeline.report import notes
 from pipeline.stereo.fusion import Fused
 from sdfsim.base.errors import SdfsimError
+from tests.helpers.balls import Distance, crate, cup, ring, shoot
 from tests.helpers.fields import SMALL, assert_resumes, posed_noise, toy_rays
+from tests.helpers.photos import photo
 from tests.helpers.sparse import NOTHING
 
 
@@ -126,8 +141,8 @@ def test_depth_draws_the_surface_to_where_a_sensor_saw_it():
     nothing = supervision_of(NOTHING, SMALL.finest)
     settings = replace(PRESETS["quick"], size=SMALL, rays=64, iterations=120, surface_points=64)
     off = []
-    for supervision in (nothing, replace(nothing, depth=ball)):
-        run = Trainer(settings, grey, supervision, 0)
+    for given in (nothing, replace(nothing, depth=ball)):
+        run = Trainer(settings, grey, given, 0)
         for _ in range(60):
             run.step()
         with torch.no_grad():
@@ -269,3 +284,316 @@ def test_a_background_is_right_between_the_photos_and_not_only_in_them(one_threa
     with torch.no_grad():
         found = background.along(origins, along, torch.full((5_000, BACKGROUND_SAMPLES), 0.5))
     assert float((found - color).square().mean().sqrt()) < 0.03
+
+
+RED, SIDE = (200, 30, 30), 40
+
+
+def views(count: int) -> tuple[View, ...]:
+    """Cameras on a ring of radius 3 that look at the origin."""
+    found = ring(count, 3.0, 0, SIDE, SIDE, 50.0)
+    return tuple(replace(view, name=f"{k}.jpg", source=f"IMG_{k}.JPG") for k, view in enumerate(found))
+
+
+def away(view: View) -> View:
+    """A camera in the same place that looks the other way."""
+    back = np.diag([-1.0, 1, -1])
+    return replace(view, rotation=back @ view.rotation, translation=back @ view.translation)
+
+
+def photos(folder: Path, count: int, *, masks: bool = False) -> None:
+    (folder / "images").mkdir()
+    save_photos([replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=masks) for k in range(count)], folder)
+    for k in range(count):
+        Image.new("RGB", (SIDE, SIDE), RED).save(folder / "images" / f"{k}.jpg", quality=98)
+        if masks:
+            (folder / "masks").mkdir(exist_ok=True)
+            row, column = np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2
+            # A ball of radius 0.5 at distance 3 is a disc of radius 50 * 0.5 / sqrt(9 - 0.25).
+            disc = np.hypot(row, column) < 50 * 0.5 / np.sqrt(8.75)
+            Image.fromarray((255 * disc).astype(np.uint8)).save(folder / "masks" / f"{k}.jpg.png")
+
+
+def cloud() -> Sparse:
+    points = np.random.default_rng(0).normal(size=(60, 3)) * 0.4
+    point_of, view_of = np.repeat(np.arange(60), 4), np.tile(np.arange(4), 60)
+    return Sparse(points, np.zeros((60, 3), np.uint8), np.full(60, 0.5), point_of, view_of)
+
+
+class Ball:
+    """A trainer whose field is a red ball of radius 0.5, opaque within a thousandth."""
+
+    settings = SimpleNamespace(long_side=120, samples=48)
+    device, beta = "cpu", 0.001
+
+    def __init__(self) -> None:
+        self.field = SimpleNamespace(
+            device=torch.device("cpu"), sdf=lambda p: p.norm(dim=1) - 0.5,
+            geometry_at=lambda p: (p.norm(dim=1) - 0.5, p, p),
+            color_of=lambda geometry, features, directions: torch.tensor(RED).expand(len(geometry), 3) / 255,
+        )  # fmt: skip
+        self.cache = sdf_cache(self.field, 2 / 128)  # type: ignore[arg-type]
+
+
+def test_a_field_that_is_right_scores_as_such(tmp_path):
+    """Pixels of the ball are those of the photo."""
+    photos(tmp_path, 2, masks=True)
+    psnr, picture = compare(load_rays(views(2), tmp_path, 100, masks=False), 0, Ball(), torch.full((3,), 0.5))  # type: ignore[arg-type]
+    assert np.abs(picture[SIDE // 2, SIDE // 2].astype(int) - RED).max() <= 2
+    # Outside the ball the photo is red and the render is the backdrop: the error of that share of pixels.
+    inside = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 / np.sqrt(8)  # of the unit sphere
+    ball = np.hypot(*(np.mgrid[0:SIDE, 0:SIDE] + 0.5 - SIDE / 2)) < 50 * 0.5 / np.sqrt(8.75)
+    wrong = ((np.array(RED) / 255 - 0.5) ** 2).mean() * (inside & ~ball).sum() / inside.sum()
+    assert psnr == pytest.approx(-10 * np.log10(wrong), abs=0.5)
+
+
+def test_held_out_photos_that_show_nothing_of_the_sphere_are_passed_over(tmp_path):
+    photos(tmp_path, 16)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=32, samples=12, iterations=40, surface_points=16)
+    some = list(views(16))
+    some[4] = away(some[4])
+    report = train(PosedPhotos(tuple(some), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report
+    assert report["held_out_photos"] == ["IMG_12.JPG"] and len(report["psnr_each"]) == 1
+    with Image.open(tmp_path / HELD_OUT / "12.jpg") as render:
+        assert report["psnr_px"] == max(render.size)
+    assert np.isfinite(report["psnr"]) and [p.name for p in (tmp_path / HELD_OUT).iterdir()] == ["12.jpg"]
+    assert score([away(view) for view in views(2)], tmp_path, Ball(), tmp_path, masked=False) == {}  # type: ignore[arg-type]
+
+
+def test_masks_count_only_where_every_photo_has_one_posed_or_not(tmp_path):
+    photos(tmp_path, 4, masks=True)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=2, surface_points=16)
+    assert train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+    known = [replace(photo(k, SIDE, SIDE), name=f"{k}.jpg", mask=k < 4) for k in range(5)]
+    save_photos(known, tmp_path)
+    assert not train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1).report["masked"]
+
+
+def test_a_budget_that_is_far_too_small_still_ends_with_a_field(tmp_path):
+    photos(tmp_path, 4)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, surface_points=16)
+    report = train(PosedPhotos(views(4), cloud()), tmp_path, tmp_path, settings=settings, threads=1, budget=1e-3).report
+    assert report["iterations"] <= FEWEST_STEPS and (tmp_path / "field.safetensors").exists()
+
+
+SETTINGS = replace(PRESETS["quick"], size=SMALL, rays=16, iterations=1000, surface_points=8)
+
+
+@pytest.fixture
+def clock(monkeypatch) -> SimpleNamespace:
+    """Every step of training takes one second, and learns nothing."""
+    clock = SimpleNamespace(now=0.0)
+
+    def timed(trainer: Trainer) -> dict[str, float]:
+        clock.now += 1.0
+        trainer.iteration += 1
+        return {"color": 0.1}
+
+    monkeypatch.setattr(training, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    monkeypatch.setattr(Trainer, "step", timed)
+    monkeypatch.setattr(training, "calibrate", lambda probe, threads: 1.0)
+    return clock
+
+
+def test_a_run_that_goes_on_has_what_is_left_of_its_budget(tmp_path, clock):
+    poses = posed_noise(tmp_path)
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole.mkdir()
+    killed.mkdir()
+    report = train(poses, tmp_path, whole, settings=SETTINGS, budget=150.0).report
+    assert report["train_seconds"] == 150.0 and report["iterations"] == 150
+    ended = clock.now
+
+    def kill(fraction: float, message: str) -> None:
+        if clock.now - ended >= 100:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(poses, tmp_path, killed, settings=SETTINGS, budget=150.0, checkpoint_every=0.0, on_progress=kill)
+    report = train(poses, tmp_path, killed, settings=SETTINGS, budget=150.0).report
+    assert report["resumed"] and report["seconds_before"] == 100.0
+    assert report["train_seconds"] == pytest.approx(150.0, abs=training.PACE)
+    assert report["train_seconds"] <= 150.0 and report["iterations"] == report["train_seconds"]
+
+
+def test_what_a_killed_run_had_trained_is_not_lost_in_silence(tmp_path, clock):
+    poses = posed_noise(tmp_path)
+    (tmp_path / "checkpoint.safetensors").write_bytes(b"half")
+    told: list[str] = []
+    report = train(poses, tmp_path, tmp_path, settings=replace(SETTINGS, iterations=20),
+                   on_progress=lambda fraction, message: told.append(message)).report  # fmt: skip
+    assert not report["resumed"] and report["iterations"] == 20
+    lost = [message for message in told if "a killed run" in message]
+    assert "what a killed run had trained is lost: checkpoint.safetensors cannot be read" in lost[0]
+    assert notes({"distill": report}) == report["notes"] == lost[:1]
+
+
+def painted_ball(view: View, gain: np.ndarray) -> np.ndarray:
+    """A photo [H, W, 3] uint8 of a ball of radius 0.5 whose colour changes from place to place, in front of grey."""
+    column, row = np.meshgrid(np.arange(SIDE) + 0.5, np.arange(SIDE) + 0.5)
+    rays = view.rays(column.ravel(), row.ravel())
+    along = -(rays @ view.center)
+    inside = along**2 - (view.center @ view.center) + 0.25
+    at = view.center + (along - np.sqrt(np.maximum(inside, 0)))[:, None] * rays
+    color = np.where(inside[:, None] > 0, 0.4 + 0.2 * np.sin(9 * at + [0, 1, 2]), 0.35)
+    return (255 * np.clip(gain * color, 0, 1) + 0.5).astype(np.uint8).reshape(SIDE, SIDE, 3)
+
+
+def test_photos_of_other_exposure_and_white_balance_train_as_those_of_one(tmp_path, one_thread, monkeypatch):
+    """Gains of up to one stop more or less, in photos that are coded with a gamma of 2.2, and tints."""
+    rng = np.random.default_rng(1)
+    cameras = [replace(view, name=f"{k}.png") for k, view in enumerate(views(12))]
+    varied = 2 ** (rng.uniform(-1, 1, (12, 1)) / 2.2) * rng.uniform(0.9, 1.1, (12, 3))
+    (tmp_path / "images").mkdir()
+    nothing = supervision.Supervision(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 6)))
+    around = np.stack([np.cos(np.linspace(0, 6, 50)), np.sin(np.linspace(0, 6, 50)), 0 * np.linspace(0, 6, 50)], 1)
+    surface = torch.tensor(0.5 * around, dtype=torch.float32)
+
+    def trained(gains: np.ndarray) -> tuple[Trainer, float, float]:
+        """The trainer, its last colour errors' mean, and how far the surface lies off in the median."""
+        for view, gain in zip(cameras, gains, strict=True):
+            Image.fromarray(painted_ball(view, gain)).save(tmp_path / "images" / view.name)
+        rays = load_rays(cameras, tmp_path, SIDE, masks=False)
+        settings = replace(PRESETS["quick"], size=SMALL, rays=256, samples=24, iterations=400, surface_points=64)
+        run = Trainer(settings, rays, nothing, 0)
+        errors = [run.step()["color"] for _ in range(settings.iterations)]
+        with torch.no_grad():
+            return run, float(np.mean(errors[-50:])), float(run.field.sdf(surface).abs().median())
+
+    plain, error, off = trained(np.ones((12, 3)))
+    run, error_varied, off_varied = trained(varied)
+    monkeypatch.setattr(training, "EXPOSURE_RATE", 0.0)
+    _, error_without, _ = trained(varied)
+    assert plain.exposure.spread() < training.VARIED / 2
+    assert error < 0.0016 and error_varied < 0.0035 and error_varied < 0.4 * error_without
+    assert off_varied < off + 0.01
+    # Of the colours that there are, as a gain and an offset can stand in for each other.
+    gain, offset = (values.detach().numpy() for values in run.exposure.of_photos())
+    ratio = (gain * 0.38 + offset) / 0.38 / varied
+    assert np.abs(ratio / ratio.mean(0) - 1).max() < 0.08
+
+
+def test_a_backdrop_that_masks_put_there_keeps_its_colour():
+    exposure = Exposure(2)
+    exposure.change.data = torch.tensor([[[0.5] * 3, [0.1] * 3], [[-0.5] * 3, [-0.1] * 3]])
+    rgb, opacity = torch.tensor([[0.5] * 3, [0.3] * 3]), torch.tensor([0.0, 1.0])
+    seen = exposure(rgb, opacity, 0.5, torch.tensor([0, 1]))
+    torch.testing.assert_close(seen, torch.tensor([[0.5] * 3, [0.5 * 0.3 - 0.1] * 3]))
+
+
+def test_a_hollow_that_is_there_from_fused_depth_is_kept_open_from_the_first_step_on():
+    """Lines of sight cross what fused depth has filled. All levels may empty it at once, where training from a ball has
+    no room for a hollow yet: coarse levels alone would fill what is open."""
+    line = np.linspace(-1, 1, 16)
+    z, y, x = np.meshgrid(line, line, line, indexing="ij")
+    rod = np.maximum(np.hypot(x, y) - 0.4, np.abs(z) - 0.6).astype(np.float32)
+    none = np.zeros((0, 3), np.float32)
+    start = Fused(rod, 31, none.astype(np.int16), none[:, 0], none)
+    sight = np.array([[0.1 * i, 0.1 * j, 0.9, 0.1 * i, 0.1 * j, -0.3] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+    down = supervision.Supervision(none, none[:, 0], sight)
+    settings = replace(PRESETS["quick"], size=SMALL, rays=16, samples=12, iterations=300, surface_points=16)
+    fused, ball = Trainer(settings, toy_rays(64), down, 0, fused=start), Trainer(settings, toy_rays(64), down, 0)
+    at = torch.tensor(sight[:, :3] + 0.5 * (sight[:, 3:] - sight[:, :3]), dtype=torch.float32)
+    before = float(fused.field.sdf(at).max())
+    for trainer in (fused, ball):
+        trainer.step()
+    assert fused.field.active == len(SMALL.steps) > ball.field.active
+    assert len(fused.free.filled) > 0 and not len(ball.free.filled)
+    for _ in range(60):
+        fused.step()
+    assert before < -0.1 and float(fused.field.sdf(at).median()) > 0
+
+
+SIZE = FieldSize((8, 16, 32, 56), (2, 2, 2, 2), 32, 16, finer_channels=(2,))
+
+
+@dataclass(frozen=True)
+class Hollow:
+    """A hollow thing that stands on the ground, about the z axis."""
+
+    distance: Distance
+    wide: float  # m, from the axis to its farthest outside
+    inside: float  # m, from the axis, where its floor is looked at
+    height: float  # m, of its rim
+    depth: float  # m, halfway up its wall from its rim down: where the wall is looked at
+
+
+HOLLOWS = {
+    "cup": Hollow(cup(0.3, 0.07, 0.38, 0.5), 0.3, 0.1, 0.5, 0.19),
+    "crate": Hollow(crate((0.7, 0.5), 0.08, 0.3, 0.4), 0.44, 0.12, 0.4, 0.15),
+}
+
+
+@dataclass(frozen=True)
+class Made:
+    """A hollow thing, and the field that its photos gave."""
+
+    of: Hollow
+    found: training.Trained
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        """The field's [...] at points [..., 3] m, in normalised units."""
+        local = self.found.to_unit.points(points.reshape(-1, 3))
+        with torch.no_grad():
+            return self.found.field.sdf(torch.tensor(local, dtype=torch.float32)).numpy().reshape(points.shape[:-1])
+
+
+@pytest.fixture(scope="module", params=["cup", pytest.param("crate", marks=pytest.mark.slow)])
+def made(request, tmp_path_factory) -> Made:
+    hollow = HOLLOWS[request.param]
+    folder: Path = tmp_path_factory.mktemp(request.param)
+    rings = [(8, 25), (8, 45), (8, 68)]
+    middle = (0.0, 0.0, hollow.height / 2)
+    views = [view for k, (count, up) in enumerate(rings)
+             for view in ring(count, 2.2, up, 200, 150, 260.0, middle, start=k * 8 + k)]  # fmt: skip
+    views = [replace(view, name=f"{n:03d}.png") for n, view in enumerate(views)]
+    poses = shoot(views, hollow.distance, folder)
+    save_photos([replace(photo(k, 200, 150), name=view.name) for k, view in enumerate(views)], folder)
+    settings = replace(
+        PRESETS["quick"], size=SIZE, rays=256, samples=24, iterations=150, surface_points=128, long_side=200, stereo=200
+    )
+    return Made(hollow, train(poses, folder, folder, settings=settings, threads=1))
+
+
+def around(count: int, start: float = 0.0) -> np.ndarray:
+    """Directions [count, 2] about the z axis."""
+    turn = start + np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack([np.cos(turn), np.sin(turn)], 1)
+
+
+def tops(distance: Distance, at: np.ndarray, height: float) -> np.ndarray:
+    """Height [P] m at which a line straight down from above meets the surface at places [P, 2]."""
+    heights = np.linspace(height + 0.1, -0.1, 400)
+    points = np.concatenate([np.repeat(at, len(heights), 0), np.tile(heights, len(at))[:, None]], 1)
+    return heights[(distance(points).reshape(len(at), -1) < 0).argmax(1)]
+
+
+def thickness(distance: Distance, hollow: Hollow) -> np.ndarray:
+    """Widths [12] m of its wall along level lines from its axis."""
+    away = np.linspace(0, hollow.wide + 0.1, 400)
+    flat = (around(12, 0.1)[:, None] * away[:, None]).reshape(-1, 2)
+    points = np.concatenate([flat, np.full((len(flat), 1), hollow.height - hollow.depth)], 1)
+    return (distance(points).reshape(12, -1) < 0).sum(1) * (away[1] - away[0])
+
+
+def test_a_hollow_is_as_deep_as_photos_see(made):
+    """Within a tenth of its depth; the ground beside it is where it should be too."""
+    assert made.found.report["stereo"]["fused"]
+    hollow, places = made.of, np.concatenate([0.4 * made.of.inside * around(8), made.of.inside * around(8)])
+    deep, wanted = (hollow.height - tops(one, places, hollow.height) for one in (made.distance, hollow.distance))
+    assert np.median(np.abs(deep / wanted - 1)) < 0.1
+    assert np.abs(tops(made.distance, (hollow.wide + 0.15) * around(8), hollow.height)).max() < 0.02
+
+
+def test_a_rim_is_as_high_as_it_is(made):
+    hollow = made.of
+    away = np.linspace(0, hollow.wide, 100)
+    places = (around(12, 0.1)[:, None] * away[:, None]).reshape(-1, 2)
+    found, wanted = (tops(one, places, hollow.height) for one in (made.distance, hollow.distance))
+    assert np.median(found[wanted > hollow.height - 0.01]) == pytest.approx(hollow.height, abs=0.02)
+
+
+def test_walls_are_as_thick_as_they_are(made):
+    """Halfway down, where photos see both sides."""
+    found, wanted = (thickness(one, made.of) for one in (made.distance, made.of.distance))
+    assert np.median(np.abs(found / wanted - 1)) < 0.3

@@ -1,4 +1,5 @@
-"""Bodies on level planes, and bodies that touch, against scenes whose signed distance is known exactly."""
+"""Bodies on level planes, bodies that touch, and supports without texture, against scenes whose signed distance is
+known exactly."""
 
 from __future__ import annotations
 
@@ -12,13 +13,14 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from pipeline.cameras import PosedPhotos, Similarity, View
+from pipeline.cameras import PosedPhotos, Similarity, Sparse, View
 from pipeline.inputs.labels import FOLDER, NAMES
 from pipeline.inputs.photos import Photo
 from pipeline.mesh import bodies
 from pipeline.mesh.bodies import Parts, split
 from pipeline.mesh.extraction import EXTENT, FieldSurface, Volume, ball, sample_volume
 from pipeline.mesh.placement import located_bodies
+from pipeline.mesh.supports import complete, on_any
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.geometry.bvh import Caster, Winding
@@ -27,6 +29,7 @@ from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from tests.helpers.sparse import NOTHING, sparse_of
 from tests.helpers.surfaces import TABLE, TOP, WALL, both, box, table
 from tests.pipeline import photo_sets
+from tests.pipeline.photo_sets import around
 
 FINEST = 0.02
 NO_POINTS = np.zeros((0, 3))
@@ -496,3 +499,158 @@ def test_what_stands_apart_on_a_board_is_three_whole_bodies(tmp_path):
     for name, true in zip(found.bodies, ("torus", "jug", "carton"), strict=True):
         sides = np.ptp(shelf.parts[["torus", "carton", "jug"].index(true)].vertices, axis=0)
         np.testing.assert_allclose(np.ptp(found.bodies[name].vertices, axis=0), sides, rtol=0.01)
+
+
+# In normalised units: half of the table's sides, its top and its underside, half of the mat's side, and the floor.
+HALF, HIGH, UNDER, MAT, GROUND = np.array([0.6, 0.4]), 0.1, 0.02, 0.2, -0.45
+GRAIN = 0.02
+UP = np.array([0.0, 0, 1])
+BROWN = np.array([150, 105, 70])
+
+
+def board_distance(points: np.ndarray) -> np.ndarray:
+    """Signed distance [P] from the table, a board, at points [P, 3]."""
+    middle, half = np.array([0, 0, (HIGH + UNDER) / 2]), np.array([*HALF, (HIGH - UNDER) / 2])
+    q = np.abs(points - middle) - half
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
+
+
+def as_trained(points: np.ndarray) -> np.ndarray:
+    """What a field has in place of the table [P]: sunk on one side of the mat, piled up on the other."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    on = (np.abs(y) < HALF[1] - 0.02) & (np.abs(x) < HALF[0] - 0.02)
+    sunk, piled = on & (x > MAT + 0.05), on & (x < -MAT - 0.05)
+    lifted = points + np.stack([0 * x, 0 * x, 0.05 * sunk - 0.07 * piled], -1)
+    return np.minimum(board_distance(np.where((z > 0.04)[..., None], lifted, points)), z - GROUND)
+
+
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory) -> tuple[FieldSurface, PosedPhotos, Path]:
+    folder = tmp_path_factory.mktemp("photos")
+    (folder / "images").mkdir()
+    corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (UNDER, HIGH)]) * [*HALF, 1]
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    ground = np.array([[-4, -4, GROUND], [4, -4, GROUND], [4, 4, GROUND], [-4, 4, GROUND]])
+    scene = Caster(Mesh(np.concatenate([corner, ground]), np.array([*faces, (8, 9, 10), (8, 10, 11)])))
+    rng = np.random.default_rng(0)
+    speckles = rng.integers(30, 220, (400, 400, 3))
+    views, point_of, view_of = [], [], []
+    points = np.concatenate([
+        np.column_stack([rng.uniform(-MAT, MAT, (60, 2)), np.full(60, HIGH)]),
+        np.column_stack([rng.uniform(-0.8, 0.8, (300, 2)), np.full(300, GROUND)]),
+    ])  # fmt: skip
+    for k, pose in enumerate(around(18, 2.4)):
+        turn = np.diag([1.0, -1, -1]) @ pose[:3, :3].T
+        view = View(f"{k:04d}.jpg", f"{k}.jpg", 240, 180, 230.0, 120, 90, 0.0, turn, -turn @ pose[:3, 3])
+        column, row = np.meshgrid(np.arange(240) + 0.5, np.arange(180) + 0.5)
+        rays = view.rays(column.ravel(), row.ravel())
+        away, face = scene.hits(view.center, rays)
+        hit = np.isfinite(away)
+        at = view.center + np.where(hit, away, 0)[:, None] * rays
+        pattern = speckles[tuple((np.mod(at[:, :2] / 0.02, 400)).astype(int).T)]
+        mat = (np.abs(at[:, :2]) < MAT).all(1) & (at[:, 2] > UNDER)
+        color = np.where(((face >= 12) | mat)[:, None], pattern, np.where(at[:, 2:] > HIGH - 1e-4, 1.0, 0.7) * BROWN)
+        color[~hit] = 200
+        # A camera's noise, and exposures that differ.
+        color = (0.8 + 0.04 * (k % 6)) * color + rng.normal(0, 2, color.shape)
+        Image.fromarray(color.clip(0, 255).astype(np.uint8).reshape(180, 240, 3)).save(
+            folder / "images" / view.name, quality=95
+        )
+        pixels, depth = view.project(points)
+        seen = (pixels > 0).all(1) & (pixels < [240, 180]).all(1) & ~scene.blocked(points + 1e-3 * UP, view.center)
+        for p in np.flatnonzero(seen & (depth > 0)):
+            point_of.append(p)
+            view_of.append(k)
+        views.append(view)
+    rgb = np.array([0.9 * speckles[tuple((np.mod(p[:2] / 0.02, 400)).astype(int))] for p in points]).astype(np.uint8)
+    sparse = Sparse(points, rgb, np.full(len(points), 0.5), np.array(point_of), np.array(view_of))
+    count = int(2.04 / GRAIN) + 1
+    empty = Volume(np.zeros((count,) * 3, np.float32), np.full(3, -1.02), GRAIN)
+    there = empty.points()
+    values = np.maximum(as_trained(there), np.linalg.norm(there, axis=-1) - 0.99)
+    volume = Volume(values.astype(np.float32), empty.low, GRAIN)
+    raw = volume.mesh()
+    raw = Mesh(raw.vertices, raw.faces, np.full(raw.vertices.shape, 128, np.uint8))
+    known = (np.abs(raw.vertices[:, :2]) < MAT + 0.03).all(1) & (np.abs(raw.vertices[:, 2] - HIGH) < 0.5 * GRAIN)
+    known |= np.abs(raw.vertices[:, 2] - GROUND) < 0.5 * GRAIN
+    shown = known[raw.faces].all(1)
+    surface = FieldSurface(volume, raw, known, np.ones(len(raw.faces), bool), shown, [], 3 * known)
+    return surface, PosedPhotos(tuple(views), sparse), folder
+
+
+def tops(volume: Volume, at: np.ndarray) -> np.ndarray:
+    """Heights [P] of the topmost surface over places [P, 2]."""
+    down = np.concatenate([at, np.full((len(at), 1), 0.9)], 1)
+    return 0.9 - Caster(volume.mesh()).hits(down, np.broadcast_to([0.0, 0, -1], down.shape))[0]
+
+
+def test_a_plain_table_goes_on_around_its_mat_up_to_its_edge_and_no_further(photographed):
+    surface, poses, folder = photographed
+    found = complete(surface, UP, GRAIN, poses, folder)
+    assert len(found) == 1 and found[0].level.height == pytest.approx(HIGH, abs=0.1 * GRAIN)
+    line = np.linspace(-0.97, 0.97, 98)
+    grid = np.stack(np.meshgrid(line, line, indexing="ij"), -1).reshape(-1, 2)
+    inner = (np.abs(grid) < HALF - 3 * GRAIN).all(1)
+    outer = (np.abs(grid) > HALF + 3 * GRAIN).any(1)
+    before, volume = tops(surface.volume, grid), found[0].filled(surface.volume)
+    after = tops(volume, grid)
+    assert np.abs(before[inner] - HIGH).max() > 0.04
+    assert (np.abs(after[inner] - HIGH) < 0.3 * GRAIN).mean() > 0.97
+    mat = (np.abs(grid) < MAT - 2 * GRAIN).all(1)
+    np.testing.assert_allclose(after[outer | mat], before[outer | mat], atol=1e-6)
+    true = 4 * HALF.prod() - 4 * MAT**2
+    assert found[0].area == pytest.approx(true, rel=0.2)
+    on = on_any(found, GRAIN)(np.array([[0.5, 0.0, HIGH], [0.5, 0.0, HIGH + 0.1], [0.9, 0.0, HIGH]]))
+    assert on.tolist() == [True, False, False]
+
+
+def test_nothing_is_completed_where_all_of_it_is_seen_or_patterned(photographed):
+    surface, poses, folder = photographed
+    # The floor has a pattern: what a field has of it is what photos show.
+    low = (surface.raw.vertices[surface.raw.faces][:, :, 2] < 0).all(1)
+    assert complete(replace(surface, shown=surface.shown & low), UP, GRAIN, poses, folder) == []
+    flat = Volume(np.minimum(board_distance(surface.volume.points()), 1).astype(np.float32), surface.volume.low, GRAIN)
+    raw = flat.mesh()
+    whole = FieldSurface(
+        flat,
+        raw,
+        np.ones(len(raw.vertices), bool),
+        *[np.ones(len(raw.faces), bool)] * 2,
+        [],
+        np.full(len(raw.vertices), 3),
+    )
+    assert complete(whole, UP, GRAIN, poses, folder) == []
+
+
+def test_a_distance_is_completed_as_its_samples_are(photographed):
+    surface, poses, folder = photographed
+    (one,) = complete(surface, UP, GRAIN, poses, folder)
+    points = surface.volume.points().reshape(-1, 3)
+    samples = one.filled(surface.volume).values.reshape(-1)
+    changed = one.within(surface.volume.at)(points)
+    np.testing.assert_allclose(changed, samples, atol=1e-5)
+    assert np.abs(changed - surface.volume.values.reshape(-1)).max() > 2 * GRAIN
+
+
+def test_flat_spots_of_a_round_thing_are_no_tables(photographed):
+    """A plain ball has flat spots on top of itself; what photos show around them is as plain as they are."""
+    surface, poses, folder = photographed
+    ball = np.linalg.norm(surface.volume.points() - [0, 0, GROUND], axis=-1) - 0.4
+    bumps = 0.01 * np.sin(40 * surface.volume.points()).prod(-1)
+    volume = replace(surface.volume, values=(ball + bumps).astype(np.float32))
+    raw = volume.mesh()
+    raw = replace(raw, colors=np.full(raw.vertices.shape, 128, np.uint8))
+    whole = FieldSurface(
+        volume,
+        raw,
+        np.ones(len(raw.vertices), bool),
+        *[np.ones(len(raw.faces), bool)] * 2,
+        [],
+        np.full(len(raw.vertices), 3),
+    )
+    plain = folder.parent / "plain"
+    (plain / "images").mkdir(parents=True, exist_ok=True)
+    for view in poses.views:
+        Image.new("RGB", (240, 180), (150, 105, 70)).save(plain / "images" / view.name)
+    assert complete(whole, UP, GRAIN, poses, plain) == []
