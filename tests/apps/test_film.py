@@ -4,8 +4,6 @@ show nothing end in a line."""
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -21,7 +19,6 @@ from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.film import identify_clips, watched, with_moving
 from sdfsim.apps.film.frames import read_clip, true_times
 from sdfsim.apps.film.room import of_room, photos_of
-from sdfsim.apps.identify.filmed import persistence as persistence_of
 from sdfsim.apps.identify.report import write_scene
 from sdfsim.base.errors import SdfsimError
 from sdfsim.scene.scene import Scene
@@ -250,22 +247,6 @@ def test_what_is_no_film_or_has_no_camera_is_said(tmp_path, bounces):
     points.write_text("points: [{pixel: [1, 2]}]")
     with pytest.raises(SdfsimError, match="must hold points"):
         sdfsim.track(bounces[0], box_scene(), points=points)
-
-
-def test_errors_of_neighbouring_frames_that_are_alike_count_less():
-    """An AR(1) process of correlation r has (1 + r) / (1 - r) times the variance of a mean of independent errors."""
-    rng = np.random.default_rng(0)
-
-    def persistence(off: np.ndarray) -> float:
-        return persistence_of(cast("Any", SimpleNamespace(root=np.ones((*off.shape, 6)))), off)
-
-    white = rng.standard_normal((2, 1000, 1, 6))
-    alike = white.copy()
-    for k in range(1, 1000):
-        alike[:, k] = 0.6 * alike[:, k - 1] + 0.8 * white[:, k]
-    assert persistence(white) == pytest.approx(1.0, abs=0.25)
-    assert persistence(alike) == pytest.approx(4.0, rel=0.2)
-    assert 1.0 <= persistence(white[:, :4]) < 3.0  # shorter than what may be alike
 
 
 PIVOT, FRICTION = np.array([-0.25, 0, 0.235]), 0.35

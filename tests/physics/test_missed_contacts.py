@@ -16,8 +16,6 @@ from sdfsim import Rollout, Simulator
 from sdfsim.evaluation.true_surfaces import Placed, TrueSurface, gaps, true_surface
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull
-from sdfsim.geometry.primitives import torus
-from sdfsim.physics.solver.world import GAP, VOID
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape
@@ -318,24 +316,3 @@ def test_who_falls_into_a_gap_meets_its_far_side(together, speed):
         worst = max(worst, deepest(deep, place + Rotation.from_quat(turn).apply(points - it.com)))
     assert worst < 0.003
     assert rollout.position[-1, -1, 2] < -0.1  # it did fall
-
-
-def test_contacts_of_linked_rings_do_not_void_each_other():
-    """Each point of a round surface is below the planes of the others. If all of them were internal edges, rings that
-    overlap would fall through each other."""
-    ring, deep = mesh_shape(torus(1.0, 0.2, 96, 32), name="ring", kind="mesh"), []
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        turn = Rotation.from_rotvec(rng.normal(0, 0.3, 3)) * Rotation.from_euler("yx", [90, 90], degrees=True)
-        moving = {"velocity": rng.normal(0, 1, 3), "angular_velocity": rng.normal(0, 30, 3)}
-        bodies = (
-            body("upper", 0, (0, 0, 0), quat_xyzw=Rotation.from_euler("x", 90, degrees=True).as_quat()),
-            body("lower", 0, (0, 0, -1.55), quat_xyzw=turn.as_quat(), **moving),
-        )
-        simulator = Simulator(Scene((ring,), bodies, np.zeros(3), 1.0), "solver")
-        simulator.step(1)
-        found = simulator.carry.scene._manifolds
-        points = found.point[0, : found.count[0]]
-        deep.append(points[points[:, GAP] < -1e-3])
-    deepest = np.concatenate(deep)
-    assert len(deepest) > 10 and not (deepest[:, VOID] > 0).any()

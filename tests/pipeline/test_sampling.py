@@ -7,32 +7,17 @@ import pytest
 import torch
 
 from pipeline.cameras import PosedPhotos, Sparse
-from pipeline.field.grid_field import FieldSize, GridField
 from pipeline.field.rendering import sdf_cache
 from pipeline.field.supervision import (
     GAP,
     NOISES,
     DepthPoints,
-    FreeSpace,
     supervision_of,
 )
 from tests.helpers.sparse import NOTHING
 from tests.helpers.surfaces import ring
 
 CELL = 2 / 127  # of the preset quick
-
-
-def test_lines_of_sight_end_before_their_points_and_stay_in_the_sphere():
-    views = ring(4)
-    xyz = np.array([[0.1, 0.0, 0.2], [0.0, 0.3, 0.0], [0.0, 0.0, 0.4]])
-    seen = np.array([0, 0, 0, 0, 1, 1, 1, 2])  # The last point has too few views to be believed.
-    sparse = Sparse(xyz, np.zeros((3, 3), np.uint8), np.full(3, 0.5), seen, np.array([0, 1, 2, 3, 0, 1, 2, 0]))
-    found = supervision_of(PosedPhotos(tuple(views), sparse), CELL)
-    np.testing.assert_allclose(found.points, xyz[:2])
-    assert found.sight.shape == (7, 6)
-    start, end = found.sight[:, :3], found.sight[:, 3:]
-    np.testing.assert_allclose(np.linalg.norm(start, axis=1), 1.0, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(end - xyz[seen[:7]], axis=1), GAP * CELL, atol=1e-9)
 
 
 def test_lines_of_sight_of_a_sensor_end_before_its_noise():
@@ -92,25 +77,3 @@ def test_the_cache_misses_no_speck_of_the_unit_sphere(slope, radius):
     assert (wanted[inside] < 0).any() and ((cache < 0) == (wanted < 0))[inside].all()
     near = inside & (wanted.abs() < 0.02 * slope)
     torch.testing.assert_close(cache[near], wanted[near], rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("radius", [0.05, 0.3])
-def test_a_filled_hollow_is_emptied_by_its_lines_of_sight(radius):
-    """A field that is a ball everywhere learns from lines of sight alone that a part of it is empty."""
-    field = GridField(FieldSize((8, 16, 32), (2, 2, 2), 16, 8), seed=0, start_radius=0.5)
-    y, z = (a.ravel() for a in np.meshgrid(np.linspace(-radius, radius, 6), np.linspace(-radius, radius, 6)))
-    sight = np.stack([np.full(36, -0.9), y, z, np.full(36, 0.0), y, z], 1)
-    free = FreeSpace(sight, CELL, "cpu")
-    optimizer = torch.optim.Adam(field.parameters(), lr=0.01)
-    rng = torch.Generator().manual_seed(0)
-    inside = torch.tensor(sight[:, :3] * [0.2, 1, 1], dtype=torch.float32)  # On the lines, within the ball.
-    assert (field.sdf(inside) < 0).all()
-    for step in range(150):
-        if step % 25 == 0:
-            free.look(sdf_cache(field, 2 / 32), rng)
-        points, clearance = free.pick(128, rng)
-        loss = torch.relu(clearance - field.sdf(points)).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert (field.sdf(inside) > 0).all()

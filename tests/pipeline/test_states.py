@@ -256,14 +256,6 @@ def test_a_drawer_is_a_slider_to_a_degree_and_a_hundredth_of_its_size(tmp_path: 
     assert len(front) and front[:, 1].max() < 0.35 and found.moving.mean() < 0.5
 
 
-def test_what_does_not_move_or_has_nothing_in_common_is_told() -> None:
-    one = whole([*CABINET, *DOOR])
-    with pytest.raises(SdfsimError, match="nothing moves"):
-        find_joint(one, one)
-    with pytest.raises(SdfsimError, match="everything moves"):
-        find_joint(one, Mesh(one.vertices + np.array([3.0, 0, 0]), one.faces))
-
-
 def test_a_screw_is_neither() -> None:
     swing = Rotation.from_rotvec([0, 0, math.radians(80)])
     about = np.array([-0.28, -0.02, 0.4])
