@@ -29,6 +29,23 @@ class Quiet(SimpleHTTPRequestHandler):
         """Nothing on stderr."""
 
 
+def served(folder: Path) -> tuple[ThreadingHTTPServer, str]:
+    """A server of a folder, and its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return server, f"http://127.0.0.1:{server.server_port}"
+
+
+def archived(members: dict[str, bytes]) -> bytes:
+    """A .tar.gz of these files."""
+    with tarfile.open(fileobj=(made := io.BytesIO()), mode="w:gz") as archive:
+        for name, content in members.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return made.getvalue()
+
+
 def cube_rows(count: int) -> np.ndarray:
     """[1, T, 19] a cube that falls, in half sides of 52.4 mm."""
     time = np.arange(count)[:, None] / 148.0
@@ -56,12 +73,7 @@ def packed(name: str) -> tuple[bytes, str]:
         torch.save(torch.from_numpy(rows(count)), file := io.BytesIO())
         content[f"x-1/assets/{folder}/{k}.pt"] = file.getvalue()
         hashed.update(file.getvalue())
-    with tarfile.open(fileobj=(made := io.BytesIO()), mode="w:gz") as archive:
-        for path, data in content.items():
-            member = tarfile.TarInfo(path)
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
-    return made.getvalue(), hashed.hexdigest()
+    return archived(content), hashed.hexdigest()
 
 
 @pytest.fixture(params=list(SETS))
@@ -73,9 +85,8 @@ def site(request, tmp_path, monkeypatch):
     file = root / known.repository / "tar.gz" / known.commit
     file.parent.mkdir(parents=True)
     file.write_bytes(content)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(root)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    monkeypatch.setattr(room, "GITHUB", f"http://127.0.0.1:{server.server_port}")
+    server, address = served(root)
+    monkeypatch.setattr(room, "GITHUB", address)
     monkeypatch.setattr(room, "SETS", {name: known})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -157,20 +168,14 @@ class Site:
         self.root = root / "shop"
         self.root.mkdir()
         self.cache = root / "cache"
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(self.root)))
-        self.url = f"http://127.0.0.1:{self.server.server_port}"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        self.server, self.url = served(self.root)
 
     def close(self) -> None:
         self.server.shutdown()
         self.server.server_close()
 
     def pack(self, members: dict[str, bytes]) -> None:
-        with tarfile.open(self.root / "cone.tar.gz", "w:gz") as archive:
-            for name, content in members.items():
-                member = tarfile.TarInfo(name)
-                member.size = len(content)
-                archive.addfile(member, io.BytesIO(content))
+        (self.root / "cone.tar.gz").write_bytes(archived(members))
 
     def kept(self) -> list[Path]:
         return [file for file in self.cache.rglob("*") if file.is_file()]

@@ -13,6 +13,9 @@ from tests.hard_cases.crashing import NEVER, Ended, Moment, Work, call, litter, 
 
 FEW, MANY = 2, 24
 COMMANDS = ["fit", "simulate", "train", "reconstruct"]
+ONE_FAST = [
+    pytest.param(n, marks=pytest.mark.slow) if n != "simulate" else n for n in COMMANDS
+]  # each has its kills among the fast tests
 
 
 def kill_and_resume(work: Work, folder: Path, moments: list[Moment], expected: dict) -> None:
@@ -46,7 +49,7 @@ def test_a_killed_command_goes_on(works, undisturbed, tmp_path, name, count):
         kill_and_resume(works[name], tmp_path / str(number) / name, some, expected)
 
 
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize("name", ONE_FAST)
 def test_ctrl_c_keeps_what_was_finished(works, undisturbed, tmp_path, name):
     ended, expected = undisturbed(name)
     work, folder = works[name], tmp_path / name
@@ -80,7 +83,7 @@ def limit_files(prepare) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000))
 
 
-@pytest.mark.parametrize("name", ["fit", "simulate", "train"])
+@pytest.mark.parametrize("name", ONE_FAST[:-1])
 def test_files_that_may_not_grow_are_told(works, undisturbed, tmp_path, name):
     work, (_, expected), folder = works[name], undisturbed(name), tmp_path / name
     ended = call(replace(work, prepare=partial(limit_files, work.prepare)), folder, NEVER, *work.again)
