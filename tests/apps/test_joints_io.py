@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import mujoco  # noqa: TID253
 import numpy as np
@@ -15,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.robots import judge
 from sdfsim import Simulator, load_scene
-from sdfsim.apps import mjcf
 from sdfsim.apps.export import export
 from sdfsim.apps.import_robot import import_robot
 from sdfsim.apps.play.saved import save_scene
@@ -494,8 +492,7 @@ def jointed() -> SceneBuilder:
     return scene
 
 
-def start_positions(scene: Scene) -> dict[str, float]:
-    return {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
+STARTS = {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
 
 
 def test_a_file_without_bodies_is_told_and_leaves_nothing(tmp_path: Path) -> None:
@@ -616,7 +613,7 @@ def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
         change = Rotation.from_matrix(one.T @ two).as_rotvec()
         if joint.kind == "hinge":
             assert here == pytest.approx(there, abs=1e-6)
-            assert change == pytest.approx([start_positions(scene)[joint.name], 0, 0], abs=1e-6)
+            assert change == pytest.approx([STARTS[joint.name], 0, 0], abs=1e-6)
         elif joint.kind == "slider":
             assert one.T @ (there - here) == pytest.approx([0.1, 0, 0], abs=1e-6)
         elif joint.kind == "distance":
@@ -667,7 +664,7 @@ def test_gltf_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
             far = [moved[along[0]]] if len(along) == 1 else [np.linalg.norm(moved[along])] if along else turned[about]
             assert all(limit["min"] - 1e-6 <= value <= limit["max"] + 1e-6 for value in far), name
         if name in ("shoulder", "elbow", "track"):
-            assert (turned + moved)[0] == pytest.approx(start_positions(scene)[name], abs=1e-6)
+            assert (turned + moved)[0] == pytest.approx(STARTS[name], abs=1e-6)
     shoulder, track, string = (found[name][2] for name in ("shoulder", "track", "string"))
     (swing,) = [limit for limit in shoulder["limits"] if limit.get("angularAxes") == [0]]
     assert (swing["min"], swing["max"]) == pytest.approx((math.radians(-30), math.radians(70)))
@@ -724,7 +721,7 @@ def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
     report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
     model, data = at_start(tmp_path / "out.xml")
-    for name, value in start_positions(scene).items():
+    for name, value in STARTS.items():
         # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
         assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
     for body in scene.bodies:
@@ -980,12 +977,6 @@ def text(**said: str) -> str:
     return SCENE.format(**places | said)
 
 
-def read_xml(folder: Path, xml: str) -> tuple[Scene, dict[str, Any]]:
-    (folder / "scene.xml").write_text(xml)
-    report = import_robot(folder / "scene.xml", folder / "scene.yaml")
-    return load_scene(folder / "scene.yaml"), report
-
-
 def features(scene: Scene) -> dict[str, bool]:
     joint = next(joint for joint in scene.joints if joint.name == "j")
     return {
@@ -1003,14 +994,16 @@ def features(scene: Scene) -> dict[str, bool]:
 @pytest.mark.parametrize("flag", ["gravity", "limit", "spring", "damper", "frictionloss", "equality", "contact",
                                   "actuation", "constraint"])  # fmt: skip
 def test_what_a_flag_switches_off_is_off_and_nothing_else(tmp_path: Path, flag: str) -> None:
-    scene, report = read_xml(tmp_path, text(option=f'<flag {flag}="disable"/>'))
+    scene, report = imported(write(tmp_path, "scene.xml", text(option=f'<flag {flag}="disable"/>')))
     off = ["limit", "frictionloss", "equality", "contact"] if flag == "constraint" else [flag]
     assert features(scene) == {name: name not in off for name in features(scene)}
     assert f"the file switches off (1: {flag})" in report["notes"]
 
 
 def test_flags_that_are_not_done_are_named(tmp_path: Path) -> None:
-    _, report = read_xml(tmp_path, text(option='<flag energy="enable" filterparent="disable" warmstart="disable"/>'))
+    _, report = imported(
+        write(tmp_path, "scene.xml", text(option='<flag energy="enable" filterparent="disable" warmstart="disable"/>'))
+    )
     named = next(line for line in report["left_out"] if line.startswith("flags of MuJoCo"))
     assert all(flag in named for flag in ("energy enable", "filterparent disable", "warmstart disable"))
 
@@ -1035,53 +1028,27 @@ def test_flags_that_are_not_done_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_said_of_an_element_is_named(tmp_path: Path, said: dict[str, str], line: str) -> None:
-    plain = set(read_xml(tmp_path, text())[1]["left_out"])
+    plain = set(imported(write(tmp_path, "scene.xml", text()))[1]["left_out"])
     assert plain == set()
-    left = read_xml(tmp_path, text(**said))[1]["left_out"]
+    left = imported(write(tmp_path, "scene.xml", text(**said)))[1]["left_out"]
     assert (len(left) == 1 and line in left[0]) if line else not left
 
 
 def test_options_of_the_step_are_named_together(tmp_path: Path) -> None:
     xml = text().replace("<option>", '<option timestep="0.004" cone="elliptic" wind="1 0 0">')
-    left = read_xml(tmp_path, xml)[1]["left_out"]
+    left = imported(write(tmp_path, "scene.xml", xml))[1]["left_out"]
     assert left == ["air: density, viscosity and wind", "options of MuJoCo's step (2: cone, timestep)"]
 
 
-class Newer:
-    """A model as a newer MuJoCo may have it, with fields that this one lacks."""
-
-    def __init__(self, model: mujoco.MjModel, **added: Any) -> None:
-        self._model, self._added = model, added
-
-    def __getattr__(self, name: str) -> Any:
-        return self._added[name] if name in self._added else getattr(self._model, name)
-
-    def __dir__(self) -> list[str]:
-        return [*dir(self._model), *self._added]
-
-
-def test_a_field_that_only_a_newer_mujoco_has_is_named() -> None:
-    model = mujoco.MjModel.from_xml_string(text())
-    plain = mujoco.MjModel.from_xml_string(mjcf.PLAIN)
-    glue = np.zeros((model.ngeom, 2))
-    assert not list(mjcf.unused(Newer(model, geom_glue=glue, moon=0.0), plain))
-    glue[2, 1] = 0.5
-    quiet = Newer(model, geom_glue=glue, foam_size=np.ones(1), moon=1.6, nfoam=1)
-    found = [(element, line, rows.tolist()) for element, line, rows in mjcf.unused(quiet, plain)]
-    assert found == [
-        ("foam", "foam_size of MuJoCo's model", [0]),
-        ("geom", "geom_glue of MuJoCo's model", [2]),
-        ("", "moon of MuJoCo's model", []),
-    ]
-
-
 def test_a_body_slides_without_friction_if_all_of_its_contacts_do(tmp_path: Path) -> None:
-    scene, report = read_xml(tmp_path, text(ground='condim="1"', ball='condim="1"', rod='condim="1"'))
+    scene, report = imported(
+        write(tmp_path, "scene.xml", text(ground='condim="1"', ball='condim="1"', rod='condim="1"'))
+    )
     rough = {body.name: body.friction for body in scene.bodies}
     # The bead has friction, so it and all that it may touch keep theirs; only what it never touches slides.
     assert rough["ground"] > 0 and rough["ball"] > 0 and rough["bob"] > 0
     assert any(note.startswith("friction of ") for note in report["notes"])
     alone = text(ground='condim="1"', ball='condim="1"', rod='condim="1"').replace('"bead"', '"bead" condim="1"')
-    scene, report = read_xml(tmp_path, alone)
+    scene, report = imported(write(tmp_path, "scene.xml", alone))
     assert all(body.friction == 0.0 for body in scene.bodies)
     assert not any("friction of" in note for note in report["notes"])

@@ -280,32 +280,6 @@ def test_gravity_may_act_for_longer_only_after_a_touch(hits, told):
     assert (judged(scene, motion(scene, place, velocity)).floating is not None) == told
 
 
-def test_what_falls_or_bounces_is_not_held():
-    """A ball in free flight that bounces with e = 0.8 within steps: its parabolas are exact."""
-    scene, speed, height = above(SLAB, 0.3), 0.0, 0.3
-    heights, speeds = [height], [speed]
-    for _ in range(150):
-        left = DT
-        while True:
-            hit = (speed + np.sqrt(speed**2 + 2 * 9.81 * height)) / 9.81
-            if hit > left:
-                break
-            speed, height, left = 0.8 * (9.81 * hit - speed), 0.0, left - hit
-            if speed < 0.05:
-                break
-        height, speed = height + speed * left - 0.5 * 9.81 * left**2, speed - 9.81 * left
-        if speed < 0 and height < 1e-3:
-            break
-        heights.append(height)
-        speeds.append(speed)
-    place = np.broadcast_to(np.stack([b.position for b in scene.bodies]), (len(heights), 2, 3)).copy()
-    place[:, 1, 2] += np.array(heights) - 0.3
-    velocity = np.zeros_like(place)
-    velocity[:, 1, 2] = speeds
-    verdict = judged(scene, motion(scene, place, velocity))
-    assert verdict.floating is None and verdict.broken == ()
-
-
 def test_a_ball_that_turns_back_before_it_touches_is_told():
     small = mesh(primitives.sphere(0.1, 4))
     big = analytic_shape("sphere", radius=0.21)
