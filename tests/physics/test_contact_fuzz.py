@@ -17,7 +17,7 @@ from sdfsim.physics.solver.convex import Convex, Pair, closest, outermost, simpl
 from sdfsim.physics.solver.prepare import _packed
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
-from tests.reference.solids import KINDS, Solid, is_sharp, least_depth, overlap, placed, views, width
+from tests.reference.solids import KINDS, Solid, across, is_sharp, least_depth, overlap, placed, views, width
 
 BLOCK, BLOCKS, MANY = 500, 3, 200  # pairs of a test; tests of the fast suite, and of both: 1,500 and 100,000 pairs
 GAPS = (0.0, 1e-6, 1e-3, 0.1, 1.0, -1e-6, -1e-3, -1e-2, -3e-2)  # of the smaller thickness
@@ -192,9 +192,7 @@ def faults(case: Case) -> list[str]:
 
 
 def _square(n: np.ndarray) -> np.ndarray:
-    u = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.6 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    w = np.cross(n, u)
+    u, w = across(n)
     return np.stack([u + w, w - u, -u - w, u - w])
 
 

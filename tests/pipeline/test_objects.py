@@ -206,12 +206,7 @@ def signed(part) -> Callable[[np.ndarray], np.ndarray]:
 
     if len(part.vertices) == 8:
         low, high = part.vertices.min(0), part.vertices.max(0)
-
-        def box(points: np.ndarray) -> np.ndarray:
-            q = np.abs(points - (low + high) / 2) - (high - low) / 2
-            return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
-
-        return box
+        return lambda points: box(points, (low + high) / 2, (high - low) / 2)
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(part.vertices.astype(np.float32)), o3d.core.Tensor(part.faces.astype(np.uint32))
@@ -386,6 +381,7 @@ def test_a_cup_and_the_vase_that_it_touches_come_apart_by_their_masks(pair, tmp_
     pair.check(found, {"cup": "cup", "vase": "vase"}, 0.5 * CELL, 0.02)
 
 
+@pytest.mark.slow
 def test_masks_of_one_of_two_leave_the_other_a_number_and_masks_of_nothing_are_reported(pair, tmp_path):
     found = pair.split(tmp_path / "p", ("cup", "spoon"))
     assert list(found.bodies) == ["object1", "cup"] and found.missing == ["spoon"]
@@ -398,7 +394,7 @@ def test_without_masks_a_cup_and_the_vase_that_it_touches_come_apart_by_their_gr
     pair.check(found, {"object1": "vase", "object2": "cup"}, 0.5 * CELL, 0.02)
 
 
-@pytest.mark.parametrize("painted", [True, False])
+@pytest.mark.parametrize("painted", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_groove_that_is_half_filled_parts_what_has_two_colours_only(painted, tmp_path):
     found = Scene(photo_sets.touching, PAIR, 0.4, fill=0.054, painted=painted).split(tmp_path / "p")
     assert len(found.bodies) == (2 if painted else 1)
@@ -430,20 +426,26 @@ def test_books_in_a_stack_come_apart_where_photos_show_borders_between_clicked_p
     books.check(found, {name: name for name in BOOKS}, 1.2 * CELL, 0.03)
 
 
+@pytest.mark.slow
 def test_several_places_of_one_body_and_the_shape_where_nothing_was_clicked(pair, tmp_path):
     found = pair.split(tmp_path / "p", clicked={"cup": [pair.click("cup"), pair.click("cup", 1)]})
     assert list(found.bodies) == ["object1", "cup"]
     pair.check(found, {"cup": "cup", "object1": "vase"}, 0.5 * CELL, 0.02)
 
 
-def test_a_place_on_the_floor_names_no_body_and_masks_beside_places_are_refused(pair, tmp_path):
+@pytest.mark.slow
+def test_a_place_on_the_floor_names_no_body(pair, tmp_path):
     floor = f"{pair.views[0].source}:240.0,350.0"
     found = pair.split(tmp_path / "p", clicked={"rug": [floor]})
     assert found.missing == ["rug"] and len(found.bodies) == 2
+
+
+def test_masks_beside_places_are_refused(pair, tmp_path):
     with pytest.raises(SdfsimError, match="body: the photos have masks of cup already"):
-        pair.split(tmp_path / "q", ("cup",), clicked={"cup": [pair.click("cup")]})
+        pair.split(tmp_path / "p", ("cup",), clicked={"cup": [pair.click("cup")]})
 
 
+@pytest.mark.slow
 def test_without_scenery_a_connected_pair_comes_apart_by_masks(tmp_path):
     free = Scene(photo_sets.touching, PAIR, 0.4, floor=False)
     found = free.split(tmp_path / "p", PAIR, alone=True)

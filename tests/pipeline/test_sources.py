@@ -584,16 +584,16 @@ def test_every_layout_gives_the_same_cameras_and_depth(layout, tmp_path):
     assert abs(np.median(height) - 0.55) < 0.002 and np.abs(height - 0.55).mean() < 0.01
 
 
-def test_the_poses_of_a_phone_are_refined(tmp_path):
-    """Every second photo: with every third one of the room, few pairs look into the vase from near, and the error only
-    halves."""
-    phone.write("polycam", tmp_path / "capture", every=2)
+@pytest.mark.parametrize(("every", "left"), [(3, 0.7), pytest.param(2, 0.5, marks=pytest.mark.slow)])
+def test_the_poses_of_a_phone_are_refined(tmp_path, every, left):
+    """With every third photo of the room, few pairs look into the vase from near, and the error only halves."""
+    phone.write("polycam", tmp_path / "capture", every=every)
     folder, out = tmp_path / "photos", tmp_path / "poses"
     folder.mkdir()
     out.mkdir()
     photos, _ = prepare_photos(tmp_path / "capture", folder)
     solve(photos, folder, out)
-    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::2]
+    frames = json.loads((TABLE_VASE / "transforms.json").read_text())["frames"][::every]
     true = np.array([(phone.TO_ARKIT @ np.array(frame["transform_matrix"]))[:3, 3] for frame in frames])
 
     def shape_error(views: list[View]) -> float:
@@ -607,7 +607,7 @@ def test_the_poses_of_a_phone_are_refined(tmp_path):
 
     given, found = load_views(folder / KNOWN_CAMERAS), load_views(out)
     assert shape_error(given) > 0.003
-    assert shape_error(found) < 0.5 * shape_error(given)
+    assert shape_error(found) < left * shape_error(given)
     # As a whole they stay in the phone's world, at its scale.
     centers = [np.array([view.center for view in views]) for views in (given, found)]
     np.testing.assert_allclose(centers[0].mean(0), centers[1].mean(0), atol=0.003)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import cli
-from pipeline.cameras import Similarity, View
+from pipeline.cameras import Similarity
 from pipeline.clearing import Cleared
 from pipeline.mesh.joint import PART, Doubt, FoundJoint, HeldPart, find_joint, load_held, scene_keys
 from pipeline.mesh.moving_part import State, tied
@@ -30,6 +30,7 @@ from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.scene.load import load_scene
 from tests.helpers.command import run as command
 from tests.helpers.photos import noise
+from tests.helpers.surfaces import look_at
 
 
 @pytest.fixture
@@ -214,7 +215,9 @@ DRAWER = [box((0.5, 0.02, 0.2), (0, -0.01, 0.5)), box((0.48, 0.3, 0.01), (0, 0.1
           box((0.1, 0.04, 0.02), (0, -0.04, 0.5))]  # fmt: skip
 
 
-@pytest.mark.parametrize(("degrees", "noise"), [(25.0, 0.0), (70.0, 0.001), (-110.0, 0.001)])
+@pytest.mark.parametrize(
+    ("degrees", "noise"), [(25.0, 0.0), *(pytest.param(d, 0.001, marks=pytest.mark.slow) for d in (70.0, -110.0))]
+)
 def test_a_door_is_a_hinge_to_a_degree_and_a_hundredth_of_its_size(degrees: float, noise: float) -> None:
     rng = np.random.default_rng(3)
     tilt = Rotation.from_rotvec([0.2, -0.3, 0.5])  # nothing is along an axis of the frame
@@ -275,11 +278,8 @@ def photographed(parts: list[trimesh.Trimesh], seed: int, noise: float = 0.002) 
     views = []
     for k in range(12):
         azimuth, height = -math.pi / 2 + math.radians(-75 + 150 * (k + 0.7 * rng.random()) / 12), (0.5, 1.2, 2.0)[k % 3]
-        eye, target = np.array([2.2 * math.cos(azimuth), 2.2 * math.sin(azimuth), height]), np.array([0, 0, 0.4])
-        ahead = (target - eye) / np.linalg.norm(target - eye)
-        right = np.cross(ahead, [0, 0, 1.0]) / np.linalg.norm(np.cross(ahead, [0, 0, 1.0]))
-        turn = np.stack([right, np.cross(ahead, right), ahead])
-        views.append(View(str(k), str(k), 640, 480, 560.0, 320.0, 240.0, 0.0, turn, -turn @ eye))
+        eye = np.array([2.2 * math.cos(azimuth), 2.2 * math.sin(azimuth), height])
+        views.append(look_at(eye, (0, 0, 0.4), name=str(k), focal=560.0))
     sight, seen = Visibility(closed, 0.004), np.zeros(len(closed.vertices), int)
     for view in views:
         seen[sight.of_view(view)[0]] += 1
@@ -309,7 +309,7 @@ SHELL = [board.copy() for board in CABINET]
 PIN, UP = np.array([-0.28, -0.02, 0.4]), np.array([0, 0, 1.0])
 
 
-@pytest.mark.parametrize("backwards", [False, True])
+@pytest.mark.parametrize("backwards", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_door_seen_from_outside_only_is_a_hinge(backwards: bool) -> None:
     """What was inside and comes into sight has not moved; in whichever order the states are given."""
     swing = Rotation.from_rotvec(-UP * math.radians(50))
@@ -324,6 +324,7 @@ def test_a_door_seen_from_outside_only_is_a_hinge(backwards: bool) -> None:
     assert math.radians(angle) < 4 * found.doubt.axis + 0.002 and beside < 4 * found.doubt.place + 0.002
 
 
+@pytest.mark.slow
 def test_a_drawer_of_which_most_was_hidden_is_a_slider() -> None:
     parts = [*DRAWER, box((0.01, 0.3, 0.16), (-0.235, 0.15, 0.5)), box((0.01, 0.3, 0.16), (0.235, 0.15, 0.5))]
     rails = [board for k, board in enumerate(SHELL)] + [box((0.56, 0.36, 0.02), (0, 0.2, 0.62)),

@@ -12,7 +12,8 @@ from pipeline.cameras import PosedPhotos, View
 from pipeline.grids.interpolation import places_of
 from pipeline.stereo.depth import BEYOND, DepthMap, outside_mask, stereo
 from pipeline.stereo.fusion import Fused, fuse
-from tests.helpers.balls import BALL, Distance, ball_on_plane, camera, cup, grey_of, ring, shoot, true_depth
+from tests.helpers.balls import BALL, Distance, ball_on_plane, cup, grey_of, ring, shoot, true_depth
+from tests.helpers.surfaces import box, look_at
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +45,7 @@ def test_depth_is_that_of_a_ball_on_a_plane(scene):
     assert np.median(error) < 0.004 and np.quantile(error, 0.95) < 0.02
 
 
+@pytest.mark.slow
 def test_depth_in_a_narrow_mouth_is_that_of_what_lies_in_it(tmp_path, monkeypatch):
     """A deep pot, seen from above. While planes are swept, its mouth is two windows wide, so most of them see the rim
     and find a lid; places tried later are to come off it. Without the farthest surface nearby 31 % are right, with it
@@ -171,8 +173,7 @@ def test_thin_solids_survive_noise(tmp_path):
     low, high = np.array([-0.35, 0.15 - cell / 2, -0.3]), np.array([0.35, 0.15 + cell / 2, 0.3])
 
     def board_and_leg(points: np.ndarray) -> np.ndarray:
-        past = np.maximum(low - points, points - high)
-        board = np.linalg.norm(np.maximum(past, 0), axis=-1) + np.minimum(past.max(-1), 0)
+        board = box(points, (low + high) / 2, (high - low) / 2)
         around = np.linalg.norm(points[..., :2] - [0.0, -0.25], axis=-1) - 0.75 * cell
         over = np.abs(points[..., 2]) - 0.3
         leg = np.hypot(np.maximum(around, 0), np.maximum(over, 0)) + np.minimum(np.maximum(around, over), 0)
@@ -206,9 +207,7 @@ def test_the_inside_of_thick_bodies_is_solid_whatever_wrong_pixels_see(tmp_path)
     half = 6 * 2 / 47
 
     def crate(points: np.ndarray) -> np.ndarray:
-        past = np.abs(points) - half
-        side = np.linalg.norm(np.maximum(past, 0), axis=-1) + np.minimum(past.max(-1), 0)
-        return np.minimum(side, points[..., 2] + half)
+        return np.minimum(box(points, (0, 0, 0), half), points[..., 2] + half)
 
     shoot(views, crate, tmp_path)
     maps = with_far_pixels(exact(views, crate), 0.01, 1.6)
@@ -236,5 +235,5 @@ def test_what_masks_leave_out_is_empty(scene, tmp_path):
 
 
 def test_two_photos_are_too_few(tmp_path):
-    views = [camera(f"{k}.png", np.array([2.0, 0.2 * k, 1.0]), np.zeros(3), 60, 45, 60.0) for k in range(2)]
+    views = [look_at((2.0, 0.2 * k, 1.0), name=f"{k}.png", size=(60, 45), focal=60.0) for k in range(2)]
     assert stereo(shoot(views, ball_on_plane, tmp_path), tmp_path, 60) == []
