@@ -774,10 +774,7 @@ def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: 
     scene, _ = imported(write(tmp_path, "robot.xml", COUPLED))
     simulator = Simulator(replace(scene, couplings=()))  # the keyframe is not where they hold
     simulator.reset(keyframe="home")
-    model = mujoco.MjModel.from_xml_string(COUPLED)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
+    _, data = at_start(mujoco.MjModel.from_xml_string(COUPLED))
     for name in "abc":
         np.testing.assert_allclose(simulator[name].centre, data.body(name).xipos, atol=1e-8)
     np.testing.assert_allclose(simulator.frame("tcp").position, data.site("tcp").xpos, atol=1e-8)
@@ -794,9 +791,7 @@ def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: 
 
 def moving_alike(simulator: Simulator, model: mujoco.MjModel, key: int) -> None:
     """Whether bodies a, b and c are and move as in MuJoCo's keyframe."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, key)
-    mujoco.mj_forward(model, data)
+    _, data = at_start(model, key)
     for name in "abc":
         speed = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, speed, 0)
@@ -855,9 +850,8 @@ def test_a_tendon_of_coupled_joints_is_a_motor_of_the_one_they_follow(tmp_path: 
       </actuator><keyframe><key name="start" qpos=".01 0" ctrl="10"/></keyframe></mujoco>"""
     scene, report = imported(write(tmp_path, "gripper.xml", text))
     assert not any("actuator" in line or "tendon" in line for line in report["left_out"] if "soft" not in line)
-    model, simulator = mujoco.MjModel.from_xml_string(text), Simulator(replace(scene, step=0.001))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    simulator = Simulator(replace(scene, step=0.001))
+    model, data = at_start(mujoco.MjModel.from_xml_string(text))
     for time in (0.05, 0.05, 0.9):
         for _ in range(round(time / 0.0005)):
             mujoco.mj_step(model, data)

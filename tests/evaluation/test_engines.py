@@ -25,7 +25,6 @@ from benchmarks.everyday import (
     table,
     unknown_to,
 )
-from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, start_of_scene, still
@@ -119,13 +118,6 @@ def test_cylinders_and_capsules_are_as_long_as_they_are(tmp_path, name, form):
     put = Put("it", shape, [0, 0, 0], v=[0, 0, 0.1], mu=0.0)
     ran = run(Setting(by=runner(name, tmp_path)), "it", [put, *walls], 0.1, gravity=0.0)
     assert ran.place("it")[:, 2].max() == pytest.approx(0.02, abs=0.003)
-
-
-def test_a_convex_mesh_is_its_own_piece(tmp_path):
-    ball, box = solid("mesh", "ball", 0.5, 3), fixed("box", solid("analytic", "box", 4, 4, 1), [0, 0, 0])
-    (piece,) = in_pieces(scene_of(Put("it", ball, [0, 0, 2]), box), tmp_path).shapes[0].pieces
-    assert len(piece) == len(ball.mesh.vertices)
-    assert np.linalg.norm(piece, axis=1) == pytest.approx(0.5, abs=1e-3)
 
 
 def test_a_motion_that_mujoco_gives_up_is_reported(tmp_path, monkeypatch):
@@ -244,17 +236,6 @@ def started(folder, text: str = SCENE):
     scene = load_scene(folder / "scene.yaml")
     units = stepper_of(load_model("gnn", weights=False)).units(scene)
     return start_of_scene(scene, folder / "engine", units), units
-
-
-def test_a_scene_is_a_start_in_the_model_s_units(tmp_path):
-    start, units = started(tmp_path)
-    assert start.floor == (0.8, 0.5)
-    motion = start.motion
-    assert np.allclose(motion.gravity, [0, 0, -10])
-    np.testing.assert_allclose(units.length * motion.position[0], [[0, 0, 0.0501], [3, 0, 8.5]])
-    np.testing.assert_allclose(motion.velocity[0, 1], [1 / units.velocity, 0, 0])
-    cube = motion.mass * (0.1 / units.length) ** 2 / 6
-    np.testing.assert_allclose(motion.inertia, np.stack([cube] * 3, -1))
 
 
 @pytest.mark.parametrize("substeps", [5, 2])

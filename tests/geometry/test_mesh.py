@@ -393,35 +393,17 @@ def test_a_thickness_that_no_fit_resolves_is_refused(thickness: float) -> None:
         solidify(sheet((0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)), thicken=thickness)
 
 
-def prism_of(sides: int, across: float = 1.0) -> Mesh:
-    """A cylinder as CAD programs export it: two long triangles a side, and fans around the middles of its ends."""
-    turn = 2 * np.pi * np.arange(sides) / sides
-    ring = 0.5 * across * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    vertices = [np.c_[ring, np.full(sides, z)] for z in (-0.5, 0.5)]
-    k = np.arange(sides)
-    after, low, high = (k + 1) % sides, np.full(sides, 2 * sides), np.full(sides, 2 * sides + 1)
-    faces = [
-        (k, after, sides + after),
-        (k, sides + after, sides + k),
-        (low, after, k),
-        (high, sides + k, sides + after),
-    ]
-    return Mesh(
-        np.concatenate([*vertices, [[0, 0, -0.5], [0, 0, 0.5]]]), np.concatenate([np.stack(f, 1) for f in faces])
-    )
-
-
 def test_long_thin_triangles_take_no_time() -> None:
     sides = 255
-    mesh = prism_of(sides)
-    solidify(prism_of(8))  # loads what is slow to load
+    mesh = primitives.cylinder(0.5, 1.0, sides)
+    solidify(primitives.cylinder(0.5, 1.0, 8))  # loads what is slow to load
     began = time.process_time()
     solid = solidify(mesh)
     assert time.process_time() - began < 2.0
     assert solid.simple and solid.notes == ()
     assert solid.mass_properties()[0] == pytest.approx(sides / 8 * np.sin(2 * np.pi / sides))
     # Two that cross, of which each is one surface with the other: as much as both, less what both hold.
-    other = prism_of(sides // 4, 0.5)
+    other = primitives.cylinder(0.25, 1.0, sides // 4)
     turned = Mesh(np.roll(other.vertices, 1, axis=1) * [1.5, 1.0, 1.0], other.faces)
     began = time.process_time()
     union = solidify(both(mesh, turned))

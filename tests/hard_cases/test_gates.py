@@ -1,7 +1,7 @@
 """What every run of every bundled model keeps to, whatever it has learned: motion, degenerate shapes, crowds, and
 states that cannot be.
 
-Of untrained networks the same is tested in tests/physics/test_solver.py and tests/learned/test_inference.py."""
+Of untrained networks the same is tested in tests/physics/test_solver.py and tests/learned/test_model.py."""
 
 import gc
 import json

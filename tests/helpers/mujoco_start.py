@@ -5,10 +5,10 @@ from pathlib import Path
 import mujoco  # noqa: TID253
 
 
-def at_start(file: Path) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """The model of an MJCF file and its state at the first keyframe."""
-    model = mujoco.MjModel.from_xml_path(str(file))
+def at_start(of: Path | mujoco.MjModel, key: int = 0) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """A model, or that of an MJCF file, and its state at a keyframe."""
+    model = of if isinstance(of, mujoco.MjModel) else mujoco.MjModel.from_xml_path(str(of))
     data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    mujoco.mj_resetDataKeyframe(model, data, key)
     mujoco.mj_forward(model, data)
     return model, data

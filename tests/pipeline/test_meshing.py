@@ -40,6 +40,7 @@ from sdfsim.shape.shape import load_shape, scaled
 from tests.helpers.balls import ring
 from tests.helpers.runs import read
 from tests.helpers.surfaces import TABLE, TOP, both, box, cube, look_at, plate
+from tests.helpers.surfaces import ring as level_ring
 from tests.pipeline import photo_sets
 from tests.pipeline.photo_sets import orbit, still_life, studio
 
@@ -69,9 +70,7 @@ class Drawn:
 
 def cameras() -> list[View]:
     """Two rings, so that the cup's inside and the table's sides are both seen."""
-    angles = np.arange(8) * np.pi / 4
-    eyes = [np.array([2.2 * np.cos(a), 2.2 * np.sin(a), z]) for z in (0.4, 2.4) for a in angles]
-    views = [look_at(eye) for eye in eyes]
+    views = [*level_ring(8, 0.4, 2.2), *level_ring(8, 2.4, 2.2)]
     return [replace(view, name=f"{k:04d}.jpg", source=f"{k}.jpg") for k, view in enumerate(views)]
 
 
@@ -310,8 +309,7 @@ def photograph(folder: Path, views: list[View], meshes: list[Mesh], colors: list
 
 def round_about(height: float, count: int = 6, far: float = 2.2) -> list[View]:
     """Cameras that look at the origin from all around."""
-    angles = 2 * np.pi * np.arange(count) / count
-    views = [look_at(np.array([far * np.cos(a), far * np.sin(a), height])) for a in angles]
+    views = level_ring(count, height, far)
     return [replace(view, name=f"{height:g}-{k}.png", source=f"{k}.png") for k, view in enumerate(views)]
 
 
@@ -395,8 +393,6 @@ def test_a_shape_folder_keeps_its_texture(tmp_path):
 
 
 def test_other_programs_read_the_glb_upright_with_texture_and_places(tmp_path):
-    import trimesh
-
     mesh = skin()
     mesh = replace(mesh, vertices=mesh.vertices + np.array([0, 0, 0.7]))
     (tmp_path / "a.glb").write_bytes(write_glb({"scene": mesh, "object1": mesh}))
@@ -650,8 +646,6 @@ def test_what_holds_no_water_is_not_hollow():
 
 def test_a_small_hole_in_a_thin_floor_does_not_hide_the_hollow():
     """As where a field lost the floor of a vase: 32 mm of a bottom of 124 mm. A tube, open below, holds no water."""
-    import trimesh
-
     near = np.linalg.norm(CUP.vertices[:, :2], axis=1)[CUP.faces].max(1) < 0.018
     found, line = told(Mesh(CUP.vertices, CUP.faces[~(near & (CUP.vertices[CUP.faces][..., 2].max(1) < 0.031))]))
     assert found.depth == pytest.approx(0.13, abs=1e-3)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from pipeline.cameras import load_poses, load_views
-from pipeline.inputs.photos import load_photos, prepare_photos
+from pipeline.cameras import load_poses, load_views, save_views
+from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
 from pipeline.sfm import poses, worker
 from pipeline.sfm.agreement import agreement, excess, excess_of_photos, unexplained
 from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find
@@ -222,8 +223,6 @@ def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
 
 
 def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
-    from PIL import Image
-
     folder = tmp_path / "in"
     folder.mkdir()
     for k in range(3):
@@ -365,8 +364,6 @@ def test_zooms_are_reported_apart_by_the_focal_lengths_of_each_photo_alone():
 def zoomed(folder: Path, count: int, zooms: dict[int, float]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Writes `count` photos of the bundled set, without EXIF, of which every so manyth is cropped to its middle and
     enlarged again; returns the true focal lengths and camera centres by file name."""
-    from PIL import Image
-
     about = json.loads((TABLE_VASE / "transforms.json").read_text())
     folder.mkdir()
     focals, centers = {}, {}
@@ -608,9 +605,6 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
     wrong = tmp_path / "wrong"
     wrong.mkdir()
     views = load_views(work)
-    from pipeline.cameras import save_views
-    from pipeline.inputs.photos import KNOWN_CAMERAS
-
     (wrong / "images").symlink_to(work / "images")
     moved = [type(v)(**{**v.__dict__, "name": o.name}) for v, o in zip(views, views[3:] + views[:3], strict=True)]
     save_views(moved, wrong / KNOWN_CAMERAS)
@@ -620,11 +614,9 @@ def test_known_cameras_are_kept_and_checked(tmp_path):
 
 def test_a_killed_run_goes_on_and_ends_as_an_undisturbed_one(tmp_path):
     """Killed once features are there, and again while it matches."""
-    import json
     import os
     import signal
     import subprocess
-    import sys
     import time
 
     photo_sets.good(tmp_path / "in", 10)

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from pipeline.cameras import CAREFUL, UNKNOWN, PosedPhotos, Similarity, Sparse, View, camera_up, triangulation_angle
+from pipeline.field.grid_field import GridField
 from pipeline.field.supervision import unit_sphere_of
 from pipeline.inputs.known_cameras import Lens
 from pipeline.inputs.photos import Photo
@@ -14,6 +16,8 @@ from pipeline.mesh.extraction import (
     all_seen,
     belonging,
     components,
+    field_colors,
+    field_distance,
     islands,
     sample_box,
     sample_volume,
@@ -37,6 +41,7 @@ from pipeline.options import options_of
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, is_closed, joined, signed_volume, vertex_normals
+from tests.helpers.fields import SMALL
 from tests.helpers.sparse import sparse_of
 from tests.helpers.surfaces import cube, look_at, plate, ring, scenery
 
@@ -434,3 +439,13 @@ def test_photos_of_the_same_name_have_to_be_reported_apart(views, photos):
     with pytest.raises(SdfsimError, match=r"distance: 8 .*'1\.jpg'") as caught:
         measured_scale(["1.jpg", "cam2/1.jpg", 1.0], views, photos, Caster(cube(1.0)))
     assert "cam0/1.jpg, cam1/1.jpg" in caught.value.hint
+
+
+@pytest.mark.gpu
+def test_distances_and_colours_are_those_of_the_processor():
+    field, points = GridField(SMALL), np.random.default_rng(0).uniform(-0.9, 0.9, (1000, 3))
+    with torch.no_grad():
+        distances, colors = field_distance(field)(points), field_colors(field, cube())
+        field = field.to("cuda")
+        np.testing.assert_allclose(field_distance(field)(points), distances, atol=1e-4)
+        np.testing.assert_allclose(field_colors(field, cube()), colors, atol=1e-3)

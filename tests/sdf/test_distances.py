@@ -8,16 +8,20 @@ import torch
 from scipy.spatial import KDTree
 
 from sdfsim.base.errors import SdfsimError
+from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Frame, Mesh
 from sdfsim.geometry.primitives import box, sphere, torus
+from sdfsim.physics.solver.prepare import _planted, compiled_shapes
+from sdfsim.physics.solver.triangles import signed_distances
 from sdfsim.sdf import grid as grid_module
 from sdfsim.sdf.closed_forms import BoxSdf, ConeSdf, PlaneSdf, SphereSdf, TorusSdf
-from sdfsim.sdf.far_field import BOX, CAUTION
+from sdfsim.sdf.far_field import BOX, CAUTION, FADE, SLOPE, everywhere
 from sdfsim.sdf.grid import GridSdf, sample_grid, trilinear
 from sdfsim.sdf.mesh_sdf import MeshSdf
 from sdfsim.sdf.reference import MeshDistance
 from sdfsim.sdf.sdf import Sdf
 from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.triangle_tree import triangle_tree
 
 BOUNDS = np.array([[-0.5] * 3, [0.5] * 3])
 
@@ -329,7 +333,6 @@ def test_the_answer_has_the_type_of_the_question(sdf: Sdf, dtype: torch.dtype) -
 def test_cones_and_rings_are_as_far_as_dense_samples_of_their_surface(sdf: Sdf) -> None:
     """And the compiled kernel says the same, also on the axis, the rim and the tip."""
     from sdfsim.physics.solver.distance import distances
-    from sdfsim.physics.solver.prepare import compiled_shapes
     from sdfsim.shape.contact_geometry import ContactGeometry
 
     turns, steps = 2 * np.pi * np.arange(600) / 600, np.linspace(0, 1, 600)
@@ -357,3 +360,140 @@ def test_cones_and_rings_are_as_far_as_dense_samples_of_their_surface(sdf: Sdf) 
     np.testing.assert_allclose(d, known, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1.0, atol=1e-9)
     np.testing.assert_allclose(n[:2000], slope[:2000], atol=1e-9)
+
+
+def distances(mesh: Mesh, points: np.ndarray, most: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+    return signed_distances(_planted([triangle_tree(mesh)]), 0, points, most)
+
+
+def test_a_box_has_its_closed_form_also_at_edges_and_corners() -> None:
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (3000, 3))
+    half = np.array([0.5, 0.7, 0.2])
+    over = np.abs(points) - half
+    wanted = np.linalg.norm(np.maximum(over, 0.0), axis=1) + np.minimum(over.max(1), 0.0)
+    found, normal = distances(primitives.box(tuple(2.0 * half)), points)
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+    ahead, _ = distances(primitives.box(tuple(2.0 * half)), points + 1e-6 * normal)
+    np.testing.assert_allclose((ahead - found)[np.abs(found) > 1e-5], 1e-6, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["torus", "gear", "bowl", "torus_knot", "cone"])
+def test_the_nearest_point_is_that_of_another_library_and_so_is_the_side(name: str) -> None:
+    import trimesh
+
+    mesh = primitives.PRIMITIVES[name]()
+    other = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    rng = np.random.default_rng(1)
+    points = other.sample(400, seed=1) + rng.normal(size=(400, 3)) * 0.03
+    _, wanted, _ = trimesh.proximity.closest_point_naive(other, points)
+    found, _ = distances(mesh, points)
+    np.testing.assert_allclose(np.abs(found), wanted, atol=1e-12)
+    around = (points[:, None, None] - other.triangles[None]).reshape(len(points), -1, 3, 3) * -1.0
+    a, b, c = around[:, :, 0], around[:, :, 1], around[:, :, 2]
+    na, nb, nc = (np.linalg.norm(side, axis=2) for side in (a, b, c))
+    volume = np.einsum("pti,pti->pt", a, np.cross(b, c))
+    dots = [np.einsum("pti,pti->pt", one, two) for one, two in ((a, b), (b, c), (c, a))]
+    solid_angle = 2.0 * np.arctan2(volume, na * nb * nc + dots[0] * nc + dots[1] * na + dots[2] * nb)
+    inside = solid_angle.sum(1) > 2.0 * np.pi
+    clear = np.abs(found) > 1e-9
+    assert ((found < 0.0) == inside)[clear].all()
+
+
+def test_what_is_farther_than_asked_is_not_found() -> None:
+    mesh = primitives.PRIMITIVES["torus"]()
+    points = np.random.default_rng(2).uniform(-1.0, 1.0, (2000, 3))
+    everything, limited = distances(mesh, points)[0], distances(mesh, points, 0.1)[0]
+    near = np.abs(everything) < 0.1
+    assert near.any()
+    np.testing.assert_array_equal(limited[near], everything[near])
+    assert np.isinf(limited[~near]).all()
+
+
+def test_a_repeated_seam_of_vertices_is_one_edge() -> None:
+    """Files for rendering repeat vertices where textures are cut: signs at such edges stay right."""
+    box = primitives.box()
+    apart = Mesh(box.vertices[box.faces].reshape(-1, 3), np.arange(3 * len(box.faces)).reshape(-1, 3))
+    points = np.random.default_rng(3).uniform(-0.8, 0.8, (2000, 3))
+    np.testing.assert_allclose(distances(apart, points)[0], distances(box, points)[0], atol=1e-12)
+
+
+def ball_at(points: torch.Tensor, centre: tuple[float, float, float] = (0, 0, 0), radius: float = 0.5) -> torch.Tensor:
+    return (points - points.new_tensor(centre)).norm(dim=-1) - radius
+
+
+def ring_at(points: torch.Tensor) -> torch.Tensor:
+    return torch.hypot(points[:, :2].norm(dim=-1) - 0.35, points[:, 2]) - 0.15
+
+
+def block(points: torch.Tensor) -> torch.Tensor:
+    q = points.abs() - points.new_tensor([0.5, 0.3, 0.2])
+    return q.clamp_min(0).norm(dim=-1) + q.amax(-1).clamp_max(0)
+
+
+def dumb_bell(points: torch.Tensor) -> torch.Tensor:
+    return torch.minimum(ball_at(points, (0.35, 0, 0), 0.15), ball_at(points, (-0.4, 0.1, 0), 0.1))
+
+
+SOLIDS = {
+    "ball": (ball_at, (0.5, 0.5, 0.5)),
+    "torus": (ring_at, (0.5, 0.5, 0.15)),
+    "block": (block, (0.5, 0.3, 0.2)),
+    "dumb-bell": (dumb_bell, (0.5, 0.2, 0.15)),
+}
+
+
+def known(solid):
+    """`solid` as it is in the box, and nothing beyond it."""
+
+    def inner(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        assert (points.abs() <= BOX).all()
+        points = points.detach().requires_grad_()
+        with torch.enable_grad():
+            value = solid(points)
+            (gradient,) = torch.autograd.grad(value.sum(), points)
+        return value.detach(), gradient
+
+    return inner
+
+
+def asked(name: str, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    solid, half = SOLIDS[name]
+    return *everywhere(known(solid), points, points.new_tensor(half)), solid(points)
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_the_far_field_is_the_distance_within_two_percent(name: str) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points = (torch.rand(20_000, 3, dtype=torch.float64, generator=generator) * 2 - 1) * 3
+    value, gradient, true = asked(name, points)
+    outside = (points.abs() > BOX).any(-1)
+    ratio = value[outside] / true[outside]
+    assert ratio.max() < 1.02
+    assert ratio.min() > 1 - CAUTION - 1e-6
+    torch.testing.assert_close(gradient[outside].norm(dim=-1), torch.ones_like(ratio))
+    inside = ~outside
+    torch.testing.assert_close(value[inside], true[inside], rtol=0, atol=1e-12)
+    # The nearest surface point is where the gradient says.
+    foot = points - true[:, None] * gradient
+    assert SOLIDS[name][0](foot[outside]).abs().quantile(0.99) < 0.25
+
+
+@pytest.mark.parametrize("name", SOLIDS)
+def test_nothing_jumps_at_the_box(name: str) -> None:
+    direction = torch.randn(500, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    on_box = direction * (BOX / direction.abs().amax(1, keepdim=True))
+    inner, outer = (asked(name, on_box * factor)[0] for factor in (1 - 1e-7, 1 + 1e-7))
+    torch.testing.assert_close(inner, outer, rtol=0, atol=1e-5)
+    full = on_box * (1 + FADE / BOX)
+    value, _, true = asked(name, full)
+    assert ((value / true) <= 1.02 * (1 - CAUTION) + 0.02).all()
+
+
+def test_gradients_keep_their_length_and_never_vanish() -> None:
+    def flat(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        length = torch.where(points[:, :1] > 0, 5.0, 0.0)
+        return torch.full_like(points[:, 0], -0.1), length * torch.tensor([1.0, 0, 0])
+
+    points = torch.tensor([[0.0, 0.0, 0.0], [-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    _, gradient = everywhere(flat, points, torch.full((3,), 0.5))
+    np.testing.assert_allclose(gradient, [[0, 0, SLOPE[0]], [-SLOPE[0], 0, 0], [SLOPE[1], 0, 0]], atol=1e-4)

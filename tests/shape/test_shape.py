@@ -227,8 +227,6 @@ def test_a_mesh_has_a_shape_without_any_fit(kind, member: type) -> None:
 def test_grids_are_cached_by_resolution_and_so_are_exact_meshes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from sdfsim.shape import make
-
     monkeypatch.setattr(make, "fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
     sizes = {}
     for resolution in (8, 12):

@@ -52,8 +52,6 @@ def test_a_push_gives_its_momentum_and_its_moment():
     # The angular momentum about the centre of mass is arm x impulse, and free flight keeps it.
     for _ in range(2):
         shape = sim.scene.shapes[0]
-        from scipy.spatial.transform import Rotation
-
         turn = Rotation.from_quat(box.quat_xyzw).as_matrix()
         inertia = turn @ (shape.inertia * 0.2 / shape.volume) @ turn.T
         np.testing.assert_allclose(inertia @ box.angular_velocity, np.cross(arm, impulse), atol=1e-9)
