@@ -218,7 +218,7 @@ SHAPES = {
 }
 
 
-def walled(load, shape: str, scale: float = 1.0) -> Scene:
+def with_wall(load, shape: str, scale: float = 1.0) -> Scene:
     body = f"{{name: it, shape: it, density: 500, scale: {scale}}}"
     return load(f"version: 1\nshapes:\n  it: {{{shape}}}\nbodies:\n  - {body}\n")
 
@@ -228,7 +228,7 @@ def walled(load, shape: str, scale: float = 1.0) -> Scene:
 def test_mass_and_inertia_are_those_of_what_is_left_around_the_hollow(load, name, scale):
     shape, inside = SHAPES[name]
     (volume, inertia), (hollow, missing) = inside(0.0), inside(0.004)
-    scene = walled(load, f"{shape}, wall: 0.004", scale)
+    scene = with_wall(load, f"{shape}, wall: 0.004", scale)
     assert scene.bodies[0].mass == pytest.approx(500 * (volume - hollow) * scale**3, rel=0.01)
     bodies, _ = from_scene(scene, Units(1.0, 1.0, 1.0))
     wanted = 500 * np.diag(inertia - missing) * scale**5
@@ -237,12 +237,12 @@ def test_mass_and_inertia_are_those_of_what_is_left_around_the_hollow(load, name
 
 
 def test_a_wall_thicker_than_the_shape_makes_it_solid(load):
-    solid, walled = (walled(load, f"sphere: {{radius: 0.1}}{more}") for more in ("", ", wall: 0.2"))
+    solid, walled = (with_wall(load, f"sphere: {{radius: 0.1}}{more}") for more in ("", ", wall: 0.2"))
     assert walled.bodies[0].mass == pytest.approx(solid.bodies[0].mass, rel=1e-3)
 
 
 def test_a_wall_changes_nothing_outside(load):
-    solid, walled = (walled(load, f"sphere: {{radius: 0.1}}{more}").shapes[0] for more in ("", ", wall: 0.004"))
+    solid, walled = (with_wall(load, f"sphere: {{radius: 0.1}}{more}").shapes[0] for more in ("", ", wall: 0.004"))
     points = np.random.default_rng(0).uniform(-0.2, 0.2, (50, 3))
     np.testing.assert_array_equal(solid.sdf(points)[0], walled.sdf(points)[0])
     np.testing.assert_array_equal(solid.nodes, walled.nodes)
