@@ -12,7 +12,7 @@ from sdfsim.apps.play import opened, show
 from sdfsim.apps.play.session import Session
 from sdfsim.apps.run import read_run
 from sdfsim.physics import pose
-from tests.simulate.test_restore import same
+from tests.helpers.runs import same
 
 
 def tabletop(**settings) -> Scene:

@@ -4,7 +4,6 @@ support to the next: seams and gaps at equal height are no walls, everything els
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import combinations_with_replacement
 
@@ -22,7 +21,7 @@ from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape, load_shape, with_sdf
 from tests.helpers.scenes import make_body as body
-from tests.helpers.shapes import SHAPES
+from tests.helpers.shapes import SHAPES, joined
 
 CONVEX = ("box", "stick", "plate", "sphere", "capsule", "cylinder", "disc", "hull", "cube mesh", "ball mesh")
 HOLLOW = ("ring", "bowl", "can", "torus mesh", "gear mesh", "bowl mesh")
@@ -134,17 +133,6 @@ def missed(kinds: tuple[str, str], count: int, seed: int) -> tuple[int, list[str
 def test_a_step_tells_every_contact(kinds, count, least):
     asked, wrong = missed(kinds, count, seed=least)
     assert asked > least and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
-
-
-def joined(name: str, boxes: list[tuple[tuple, tuple]], *, pieces: bool) -> Shape:
-    """A body made of boxes, given by their lowest and highest corners; with these as convex pieces, or as a surface."""
-    parts = [primitives.box(np.subtract(high, low)) for low, high in boxes]
-    parts = [
-        Mesh(part.vertices + np.add(low, high) / 2, part.faces) for part, (low, high) in zip(parts, boxes, strict=True)
-    ]
-    faces = np.concatenate([part.faces + 8 * k for k, part in enumerate(parts)])
-    whole = mesh_shape(Mesh(np.concatenate([part.vertices for part in parts]), faces), name=name, kind="mesh")
-    return replace(whole, pieces=tuple(part.vertices for part in parts)) if pieces else whole
 
 
 LOW = ((0.4, -0.3, 0.0), (1.0, 0.3, 0.8))  # a block that is lower than the one beside it

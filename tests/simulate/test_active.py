@@ -17,7 +17,7 @@ from sdfsim.shape import contact_geometry
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import contact_edges, make_body, random_model, surface_model
-from tests.physics.test_missed_contacts import joined
+from tests.helpers.shapes import joined
 
 
 def same(one, other) -> bool:
