@@ -1,4 +1,4 @@
-"""What the tests share: where the data that is not part of the project lies."""
+"""What the tests share: small recordings and scenes, and where the data that is not part of the project lies."""
 
 import os
 from collections.abc import Iterator
@@ -6,6 +6,11 @@ from pathlib import Path
 
 import pytest
 from joblib import parallel_config
+
+from tests.helpers.recordings import ball_data, cube_data, cube_meshes, presets
+from tests.helpers.scenes import box_shape, dropped, free_pair
+
+__all__ = ["ball_data", "box_shape", "cube_data", "cube_meshes", "dropped", "free_pair", "presets"]
 
 
 @pytest.fixture(scope="session", autouse=True)

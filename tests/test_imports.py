@@ -45,6 +45,13 @@ FLOORS = [
 ]
 
 
+# The same of the pipeline's.
+PIPELINE = (
+    ("records", "materials", "naming", "cameras", "grids", "clearing"), ("options",), ("inputs",), ("sfm",),
+    ("stereo",), ("field",), ("mesh",), ("scene_writer", "report", "measure"), ("stages",), ("states",), ("commands",),
+)  # fmt: skip
+
+
 @cache
 def modules() -> dict[str, Path]:
     """The files of our modules by name."""
@@ -108,6 +115,15 @@ def circles() -> list[set[str]]:
 
 def test_imports_go_down():
     assert not upwards()
+
+
+def test_imports_of_the_pipeline_go_down():
+    level = {room: number for number, rooms in enumerate(PIPELINE) for room in rooms}
+    for module, others in imports().items():
+        for other in others:
+            if module.startswith("pipeline.") and other.startswith("pipeline."):
+                rooms = [name.split(".")[1] for name in (module, other)]
+                assert rooms[0] == rooms[1] or level[rooms[0]] > level[rooms[1]], f"{module} imports {other}"
 
 
 def test_there_are_no_circles():

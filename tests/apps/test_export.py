@@ -12,8 +12,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco  # noqa: TID253
 import numpy as np
 import pytest
+import trimesh  # noqa: TID253
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
 from scipy.spatial.transform import Rotation
 
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
@@ -27,6 +30,7 @@ from sdfsim.scene.scene import Scene
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import load_shape
 from tests.helpers.command import run
+from tests.helpers.mujoco_start import at_start
 
 SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
 SECONDS = 1.2
@@ -149,8 +153,6 @@ def test_a_glb_of_a_run_moves_as_the_run_did(dropped):
 
 
 def test_trimesh_finds_the_bodies_of_a_glb_upright_and_in_place(dropped):
-    import trimesh
-
     found = trimesh.load_scene(dropped.export("scene.glb", motion=False))
     turn = Rotation.from_euler("x", -90, degrees=True).as_matrix()
     for name, plain in (("cone", "cone"), ("1 box", "_1_box"), ("sweep", "sweep")):
@@ -177,8 +179,6 @@ def test_vertex_colours_are_kept_as_light(tmp_path):
 
 
 def test_a_texture_lies_where_it_lay(tmp_path):
-    import trimesh
-
     shape = load_shape(SHAPES / "ring")
     rng = np.random.default_rng(0)
     uv, texture = rng.random((len(shape.mesh.vertices), 2)), np.zeros((32, 64, 3), dtype=np.uint8)
@@ -287,8 +287,6 @@ def test_blender_opens_a_run_with_the_add_on(dropped):
 
 @pytest.mark.slow
 def test_validators_of_usd_find_no_fault(dropped, tmp_path):
-    from pxr import Usd, UsdPhysics, UsdValidation
-
     every = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     for sample in ("cart", "ragdoll"):
         export(sample, tmp_path / f"{sample}.usdc")
@@ -328,8 +326,6 @@ def test_options_that_a_format_has_no_use_for_are_refused(dropped, tmp_path):
 @pytest.mark.parametrize("fps", [24, 29.97])
 def test_a_usd_stage_plays_whole_frames_at_the_rate_that_was_asked_for(dropped, tmp_path, fps):
     """A program that plays one time code a frame shows the ball where it was at that time."""
-    from pxr import Usd, UsdGeom
-
     export(dropped.folder, tmp_path / "run.usda", fps=fps, allow_outside=True)
     stage = Usd.Stage.Open(str(tmp_path / "run.usda"))
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == fps
@@ -344,8 +340,6 @@ def test_a_usd_stage_plays_whole_frames_at_the_rate_that_was_asked_for(dropped, 
 
 @pytest.mark.parametrize("ending", ["usda", "usdc"])
 def test_a_usd_stage_has_the_motion_and_the_physics(dropped, ending):
-    from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade
-
     stage = Usd.Stage.Open(str(dropped.export(f"run.{ending}")))
     assert UsdGeom.GetStageUpAxis(stage) == "Z" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
     gravity = UsdPhysics.Scene(stage.GetPrimAtPath("/World/physics"))
@@ -372,8 +366,6 @@ def test_a_usd_stage_has_the_motion_and_the_physics(dropped, ending):
 
 
 def test_usd_colliders_are_exact_forms_hulls_or_triangles(dropped):
-    from pxr import Usd, UsdGeom, UsdPhysics
-
     stage = Usd.Stage.Open(str(dropped.export("scene.usda", motion=False)))
 
     def colliders(name: str) -> list:
@@ -395,8 +387,6 @@ def test_usd_colliders_are_exact_forms_hulls_or_triangles(dropped):
 def test_usd_samples_distances_of_a_body_without_pieces(tmp_path):
     """As PhysX (Isaac Sim, ManiSkill) and Newton read it; the former needs a resolution above 0, the latter one that
     eight divides."""
-    from pxr import Usd, UsdPhysics
-
     ring = mesh_shape(load_shape(SHAPES / "ring").mesh, name="hoop", kind="grid")
     ring.save(tmp_path / "hoop")
     export(tmp_path / "hoop", tmp_path / "hoop.usda")
@@ -411,8 +401,6 @@ def test_usd_samples_distances_of_a_body_without_pieces(tmp_path):
 
 
 def test_usd_groups_keep_apart_what_collides_with_does(dropped):
-    from pxr import Usd, UsdPhysics
-
     stage = Usd.Stage.Open(str(dropped.export("scene.usda", motion=False)))
     table = UsdPhysics.CollisionGroup.ComputeCollisionGroupTable(stage)
     group = {}
@@ -435,9 +423,7 @@ def assert_rests(there: np.ndarray, ours: np.ndarray, name: str) -> None:
 
 
 def test_mujoco_rests_where_we_do(dropped):
-    import mujoco
-
-    model = mujoco.MjModel.from_xml_path(str(dropped.export("scene.xml", motion=False)))
+    model, data = at_start(dropped.export("scene.xml", motion=False))
     for name in ("the ring", "cone"):
         body = model.body(name.replace(" ", "_"))
         assert body.mass[0] == pytest.approx(dropped.scene.bodies[dropped.index(name)].mass)
@@ -452,8 +438,6 @@ def test_mujoco_rests_where_we_do(dropped):
         )
     }
     assert told["floor", "the_ring"] == pytest.approx(0.48)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
     while data.time < SECONDS:
         mujoco.mj_step(model, data)
     for name in RESTING:
@@ -463,14 +447,10 @@ def test_mujoco_rests_where_we_do(dropped):
 
 def test_mujoco_rests_where_we_do_on_distances_too(dropped, tmp_path):
     """Without convex pieces: MuJoCo samples the mesh itself, and a ball comes to rest in the hollow of the bowl."""
-    import mujoco
-
     export(dropped.file, tmp_path / "scene.xml", collide="sdf", allow_outside=True)
     assert len(list(tmp_path.rglob("*.obj"))) == 3  # the ring, the cone and the bowl, uncut
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    model, data = at_start(tmp_path / "scene.xml")
     assert (model.geom_type == mujoco.mjtGeom.mjGEOM_SDF).sum() == 3
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
     while data.time < SECONDS:
         mujoco.mj_step(model, data)
     for name in ("the ring", "cone", "ball"):
@@ -545,8 +525,6 @@ joints:
 
 
 def test_mujoco_starts_with_the_velocity_of_the_centre_of_mass(tmp_path):
-    import mujoco
-
     text = """
 version: 1
 bodies: [{{name: a, shape: s, velocity: [1, 2, 3], angular_velocity: [0.5, -1, 2], euler_xyz_deg: [20, 30, 40]}}]
@@ -555,9 +533,7 @@ shapes: {{s: {{asset: {shapes}/cone}}}}
     (tmp_path / "scene.yaml").write_text(text.format(shapes=SHAPES))
     export(tmp_path / "scene.yaml", tmp_path / "scene.mjcf", allow_outside=True)
     model = mujoco.MjModel.from_xml_string((tmp_path / "scene.mjcf").read_text(), assets(tmp_path / "scene_assets"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
+    _, data = at_start(model)
     velocity = np.zeros(6)
     mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, 1, velocity, 0)
     np.testing.assert_allclose(velocity, [0.5, -1, 2, 1, 2, 3], atol=1e-7)
@@ -588,7 +564,6 @@ def test_an_open_surface_is_cut_as_the_solid_of_its_distance(tmp_path, monkeypat
 
 def test_a_solid_without_pieces_is_cut_once_by_coacd(tmp_path, monkeypatch, caplog):
     import coacd
-    import mujoco
 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     half = np.array([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]) * 0.1
@@ -620,23 +595,6 @@ def test_a_solid_without_pieces_is_cut_once_by_coacd(tmp_path, monkeypatch, capl
     assert model.body("angle").mass[0] == pytest.approx(1000 * 0.003)
     corners = model.mesh_vert.reshape(-1, 3)
     assert np.isfinite(corners).all() and model.ngeom == len(report["files"]) - 1
-
-
-def test_a_shape_becomes_one_urdf(tmp_path):
-    import pybullet as engine
-
-    report = export(SHAPES / "cone", tmp_path / "cone.urdf")
-    assert [path.name for path in report["files"]] == ["cone.urdf", "cone.obj", "cone-0.obj"]
-    shape = load_shape(SHAPES / "cone")
-    engine.connect(engine.DIRECT)
-    try:
-        body = engine.loadURDF(str(tmp_path / "cone.urdf"), flags=engine.URDF_USE_INERTIA_FROM_FILE)
-        assert engine.getDynamicsInfo(body, -1)[0] == pytest.approx(1000 * shape.volume)
-        np.testing.assert_allclose(engine.getBasePositionAndOrientation(body)[0], shape.com, atol=1e-9)
-        low, high = engine.getAABB(body)
-        np.testing.assert_allclose([low, high], shape.sdf.bounds, atol=0.005)
-    finally:
-        engine.disconnect()
 
 
 # --- poses ---
@@ -693,8 +651,6 @@ HOUSES = {"house": [[0, 0, 0], [8, 8, 3]], "turned": [[12, 0, 0], [20, 8, 3]]}
 
 
 def test_a_glb_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:
-    import trimesh
-
     report = export(survey, survey.with_suffix(".glb"))
     assert any("far from its origin" in note and "512349.27 5401238.61 332.5" in note for note in report["notes"])
     found: dict[str, Any] = {}
@@ -710,12 +666,8 @@ def test_a_glb_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> No
 
 
 def test_mujoco_loads_what_is_far_from_its_origin(survey: Path) -> None:
-    import mujoco
-
     export(survey, survey.with_suffix(".xml"))
-    model = mujoco.MjModel.from_xml_path(str(survey.with_suffix(".xml")))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    model, data = at_start(survey.with_suffix(".xml"))
     mujoco.mj_step(model, data, 1000)
     # Each has fallen by the half metre, and lies there. The centre of the L, by hand: 24 m^2 at (4, 1.5), 15 at
     # (1.5, 5.5).
@@ -734,10 +686,6 @@ def test_a_csv_has_the_poses_of_the_origins_wherever_they_are(survey: Path) -> N
 
 
 def test_names_of_any_script_are_kept_where_the_format_can(tmp_path: Path) -> None:
-    import mujoco
-    import trimesh
-    from pxr import Usd
-
     analytic_shape("box", size=(0.1, 0.1, 0.1)).save(tmp_path / "box")
     mesh_shape(primitives.box((0.1, 0.1, 0.1)), name="木", kind="mesh").save(tmp_path / "木")
     scene = SceneBuilder()
@@ -780,8 +728,6 @@ def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
 
 
 def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:
-    from pxr import Usd, UsdGeom
-
     export(survey, survey.with_suffix(".usda"))
     stage = Usd.Stage.Open(str(survey.with_suffix(".usda")))
     for name, box in HOUSES.items():
@@ -789,26 +735,6 @@ def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> No
         to_world = np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(Usd.TimeCode.Default()))
         points = np.array(prim.GetPointsAttr().Get(), dtype=float) @ to_world[:3, :3] + to_world[3, :3] - FAR
         np.testing.assert_allclose([points.min(0), points.max(0)], box, atol=1e-4)
-
-
-def test_a_part_of_a_third_of_a_millimetre_loads_in_mujoco_and_falls(tmp_path: Path) -> None:
-    import mujoco
-
-    size, (low, high) = 3.6e-4, (0.0, 1.2e-3)
-    mesh_shape(primitives.box((size,) * 3), name="speck", kind="mesh").save(tmp_path / "speck")
-    scene = SceneBuilder().add("floor", plane={"offset": low})
-    scene.add("speck", asset=tmp_path / "speck", position=(0, 0, high), density=1000)
-    report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "scene.xml")
-    (line,) = (line for line in report["left_out"] if "MuJoCo refuses" in line)
-    assert "speck" in line and "mm" in line and "1e-9 kg" in line
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    assert model.body("speck").mass[0] * 1e-9 == pytest.approx(1000 * size**3, rel=1e-6)
-    mujoco.mj_step(model, data, 10)
-    assert (1000 * high - data.body("speck").xpos[2]) / 1000 == pytest.approx(9.81 * 0.01**2 / 2, rel=0.12)
-    mujoco.mj_step(model, data, 500)
-    assert data.body("speck").xpos[2] / 1000 == pytest.approx(size / 2, rel=0.05)
 
 
 def test_cones_and_rings_are_meshes_for_engines(tmp_path: Path) -> None:
@@ -819,8 +745,6 @@ def test_cones_and_rings_are_meshes_for_engines(tmp_path: Path) -> None:
     files = {suffix: tmp_path / f"out.{suffix}" for suffix in ("xml", "usda", "glb")}
     for file in files.values():
         export(made.save(tmp_path / "scene.yaml"), file)
-    import mujoco
-
     model = mujoco.MjModel.from_xml_path(str(files["xml"]))
     geoms = [model.geom(k) for k in range(model.ngeom)]
     assert sum(geom.name.startswith("cone") for geom in geoms) == 1

@@ -1,6 +1,7 @@
 """Many meshes at once: in processes, on a cluster."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -152,16 +153,12 @@ def test_names(meshes: Path, tmp_path: Path) -> None:
 
 
 def where(number: int) -> tuple[int, int, int]:
-    import os
-
     if number == 13:
         raise ValueError("unlucky")
     return number * number, os.getpid(), torch.get_num_threads()
 
 
 def test_work_is_spread_over_processes_of_one_thread() -> None:
-    import os
-
     with parallel_config(backend="loky"):
         found = dict(parallel(where, [(n,) for n in range(6)]))
     assert [found[n][0] for n in range(6)] == [n * n for n in range(6)]

@@ -22,7 +22,6 @@ from sdfsim.apps.identify.optimiser import identify
 from sdfsim.apps.identify.report import picture, report_lines, write_scene
 from sdfsim.apps.observed import COLUMNS, load_recordings
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.pybullet_sim import import_pybullet
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene
 from sdfsim.simulate.simulator import Simulator, run_all
@@ -116,15 +115,17 @@ def test_a_body_that_only_falls_tells_nothing(recorded, tmp_path):
 # --- closed forms ---
 
 
-def sliding_block(folder: Path, *, friction: float = 0.3, slope: float = 0.0, noise: float = 0.0) -> Path:
-    """A block of 20 cm that slides to a stop, straight over ground that rises by `slope` rad along x."""
-    time = np.arange(0.0, 1.2, 0.01)
+def sliding_block(folder: Path, *, friction=0.3, slope=0.0, noise=0.0, rest: int | None = None) -> Path:
+    """A block of 20 cm that slides to a stop, straight over ground that rises by `slope` rad along x, for 1.2 s in
+    all; or `rest` frames longer than it slides, and then without noise."""
     push = 9.81 * (friction * np.cos(slope) + np.sin(slope))
     stop = 2.0 / push
+    time = 0.01 * np.arange(120 if rest is None else int(stop / 0.01) + 1 + rest)
     way = np.where(time < stop, 2.0 * time - 0.5 * push * time**2, 0.5 * 2.0 * stop)
     turn = Rotation.from_euler("y", -slope)
     place = turn.apply(np.stack([way, 0 * way, np.full_like(way, 0.1)], 1))[:, None]
-    place += noise * np.random.default_rng(1).standard_normal(place.shape)
+    shaken = (time < stop) | (rest is None)
+    place += noise * np.random.default_rng(1).standard_normal(place.shape) * shaken[:, None, None]
     write_poses(folder / "block.csv", time, ["block"], place, np.tile(turn.as_quat(), (len(time), 1, 1)))
     bodies = [
         {"name": "ground", "plane": {"normal": turn.apply([0, 0, 1]).tolist()}, "friction": 1.0, "restitution": 1.0},
@@ -299,67 +300,6 @@ def test_a_start_is_fitted_through_the_flight(tmp_path):
     assert found.noise[0] == pytest.approx(3e-4, rel=0.4)
 
 
-# --- another engine ---
-
-
-def pybullet_tosses(folder: Path, tilt: float = 0.02, count: int = 16) -> Path:
-    """A box tossed onto ground at z = 0.5 that is tilted about y, by PyBullet in steps of a millisecond."""
-    engine = import_pybullet()
-    rng, arrays, start = np.random.default_rng(4), {"position": [], "quat_xyzw": []}, [0]
-    turn = Rotation.from_euler("y", tilt)
-    for _ in range(count):
-        client = engine.connect(engine.DIRECT)
-        engine.setGravity(0, 0, -9.81)
-        engine.setTimeStep(1e-3)
-        plane = engine.createMultiBody(
-            0.0,
-            engine.createCollisionShape(engine.GEOM_PLANE),
-            basePosition=[0, 0, 0.5],
-            baseOrientation=turn.as_quat(),
-        )
-        engine.changeDynamics(plane, -1, lateralFriction=1.0, restitution=1.0)
-        shape = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[0.05, 0.04, 0.03])
-        quat = Rotation.random(rng=rng).as_quat()
-        box = engine.createMultiBody(0.5, shape, basePosition=[0, 0, 0.72], baseOrientation=quat)
-        engine.changeDynamics(box, -1, lateralFriction=0.25, restitution=0.0, linearDamping=0, angularDamping=0)
-        velocity = [*rng.uniform(-1, 1, 2), 0.5]
-        engine.resetBaseVelocity(box, velocity, rng.normal(0, 4, 3).tolist())
-        for _ in range(120):
-            place, quat = engine.getBasePositionAndOrientation(box)
-            arrays["position"].append(place)
-            arrays["quat_xyzw"].append(quat)
-            for _ in range(8):
-                engine.stepSimulation()
-        start.append(len(arrays["position"]))
-        engine.disconnect(client)
-    place = np.array(arrays["position"]) + 1e-4 * rng.standard_normal((start[-1], 3))
-    np.savez(folder / "tosses.npz", dt=0.008, start=start, position=place, quat_xyzw=arrays["quat_xyzw"])
-    bodies = [
-        {"name": "ground", "plane": {"offset": 0.497}, "friction": 1.0, "restitution": 1.0},
-        {"name": "box", "shape": "box", "position": [0, 0, 1], "mass": 0.5},
-    ]
-    return write_scene_file(folder / "scene.yaml", {"box": {"box": {"size": [0.1, 0.08, 0.06]}}}, bodies)
-
-
-@pytest.mark.slow
-def test_tosses_of_another_engine_show_friction_and_ground_that_is_tilted(tmp_path):
-    scene = pybullet_tosses(tmp_path)
-    out = tmp_path / "identified.yaml"
-    done = CliRunner().invoke(
-        cli.app, ["identify", str(tmp_path / "tosses.npz"), "--scene", str(scene), "-o", str(out), "--json"]
-    )
-    assert done.exit_code == 0, done.output
-    found = json.loads(done.stdout)
-    assert found["friction"]["box / ground"]["value"] == pytest.approx(0.25, abs=0.04)
-    assert found["tilt"]["ground about y"]["value"] == pytest.approx(np.degrees(0.02), abs=0.25)
-    assert found["tilt"]["ground about x"]["value"] == pytest.approx(0.0, abs=0.25)
-    assert found["held_out"]["recordings"] == 2
-    assert found["held_out"]["after"][0] < 0.6 * found["held_out"]["before"][0]
-    ground = load_scene(out).bodies[0]
-    normal = Rotation.from_quat(ground.quat_xyzw).apply([0, 0, 1])
-    assert ground.position @ normal / normal[2] == pytest.approx(0.5, abs=0.002)
-
-
 # --- the scene that is written ---
 
 
@@ -393,7 +333,6 @@ def test_the_scene_that_is_written_moves_as_identified(tmp_path):
     assert slab.restitution * box.restitution == pytest.approx(0.3, abs=0.03)
     truth = known[0].bodies[1]
     assert box.mass == pytest.approx(truth.mass)
-    assert box.inertia is not None and truth.inertia is not None
     assert np.trace(box.inertia) == pytest.approx(np.trace(truth.inertia), rel=0.05)
     assert box.scale == pytest.approx(1.0, abs=0.01)
     top = Rotation.from_quat(slab.quat_xyzw).apply([0, 0, 0.1]) + slab.position
@@ -457,43 +396,24 @@ def test_no_scene_and_empty_folders_are_told(tmp_path):
         load_recordings([tmp_path / "empty"])
 
 
-def sliding(folder: Path, friction: float, noise: float, rest: int, seed: int = 0) -> tuple[Path, Path]:
-    """A box that slides to a stop by its closed form, with noise while it moves, then `rest` frames exactly still."""
-    dt, speed, rng = 0.01, 1.2, np.random.default_rng(seed)
-    stop = speed / (friction * 9.81)
-    time = dt * np.arange(int(stop / dt) + 1 + rest)
-    way = np.minimum(time, stop)
-    place = np.zeros((len(time), 1, 3))
-    place[:, 0] = np.stack([speed * way - 0.5 * friction * 9.81 * way**2, 0 * way, 0 * way + 0.05], 1)
-    place += noise * rng.standard_normal(place.shape) * (time < stop)[:, None, None]
-    bodies = [
-        {"name": "floor", "motion": "static", "plane": {"normal": [0, 0, 1], "offset": 0.0}}
-        | {"friction": 1, "restitution": 1},
-        {"name": "box", "shape": "box", "position": [0, 0, 0.05], "friction": 0.3, "restitution": 0.2, "mass": 1},
-    ]
-    scene = write_scene_file(folder / "scene.yaml", {"box": {"box": {"size": [0.2, 0.15, 0.1]}}}, bodies, duration=1.0)
-    turn = np.tile(LEVEL, (len(time), 1, 1))
-    return write_poses(folder / f"slide{seed}.csv", time, ["box"], place, turn), scene
-
-
 @pytest.mark.parametrize("rest", [0, 51, 400])
 @pytest.mark.parametrize("noise", [1e-4, 0.0])
 def test_rest_after_a_slide_hides_nothing_of_its_friction(tmp_path, rest, noise):
-    file, scene_file = sliding(tmp_path, 0.42, noise, rest)
-    recordings, scene = load_recordings([file], scene_file)
+    scene_file = sliding_block(tmp_path, friction=0.42, noise=noise, rest=rest)
+    recordings, scene = load_recordings([tmp_path / "block.csv"], scene_file)
     assert recordings[0].noise[0] == pytest.approx(max(noise, 4e-7), rel=0.5)
     assert recordings[0].known[:20].all()
     found = identify(recordings, scene).report()
-    friction = found["friction"]["box / floor"]
+    friction = found["friction"]["block / ground"]
     assert friction["value"] == pytest.approx(0.42, abs=0.01)
     assert friction["interval"][0] - 1e-3 <= 0.42 <= friction["interval"][1] + 1e-3
-    # What is left of the motion is compared, not the rest: as the scene was, the box came a tenth of its way too far.
+    # What is left of the motion is compared, not the rest: as the scene was, the block came a tenth of its way too far.
     assert found["held_out"]["before"][0] > 5.0 and found["held_out"]["covered"] > 0.9
 
 
 def test_whole_motions_that_begin_late_are_told(tmp_path):
     """The tracker shakes until half of the way, so that no frame before is smooth."""
-    file, scene_file = sliding(tmp_path, 0.3, 0.0, 60)
+    scene_file, file = sliding_block(tmp_path, rest=60), tmp_path / "block.csv"
     rows, rng = list(csv.reader(file.open())), np.random.default_rng(0)
     for row in rows[1:14]:
         row[2:4] = [str(float(value) + rng.normal(0.0, 3e-3)) for value in row[2:4]]

@@ -1,4 +1,5 @@
-"""Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand."""
+"""Joints in files of other programs: imports and exports, judged by MuJoCo, PyBullet, OpenUSD and by hand. What an
+MJCF file says is done or named."""
 
 import json
 import math
@@ -29,6 +30,7 @@ from sdfsim.shape.parts import GREY
 from sdfsim.simulate.looks import body_colors
 from sdfsim.simulate.record import at_frame
 from tests.helpers.command import run
+from tests.helpers.mujoco_start import at_start
 
 LINK = """
   <link name="{0}">
@@ -235,9 +237,7 @@ def servos(armature: float) -> str:
 def in_mujoco(file: Path, seconds: float) -> tuple[np.ndarray, int]:
     """Positions of joints at the end, and how often a motor's force changes its sign by more than a thousandth of the
     largest force."""
-    model = mujoco.MjModel.from_xml_path(str(file))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    model, data = at_start(file)
     forces = []
     while data.time < seconds:
         mujoco.mj_step(model, data)
@@ -445,7 +445,6 @@ def test_mjcf_has_the_poses_and_masses_that_mujoco_has(tmp_path: Path) -> None:
     assert len(small) == 1 and small[0].mass == pytest.approx(0.02 * float(model.body("boom").mass[0]))
     joints = {joint.name: joint for joint in scene.joints}
     assert joints["yaw"].limits == pytest.approx((-math.pi / 2, math.pi / 2))
-    assert joints["pitch"].spring is not None
     assert (joints["pitch"].spring.stiffness, joints["pitch"].spring.rest) == pytest.approx((4.0, math.radians(20)))
     assert (joints["yaw"].damping, joints["roll"].damping, joints["reel"].friction) == pytest.approx((0.2, 0.5, 0.3))
     assert joints["swing"].kind == "ball"
@@ -493,8 +492,7 @@ def jointed() -> SceneBuilder:
     return scene
 
 
-def start_positions(scene: Scene) -> dict[str, float]:
-    return {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
+STARTS = {"shoulder": math.radians(20), "elbow": math.radians(-15), "track": 0.1}
 
 
 def test_a_file_without_bodies_is_told_and_leaves_nothing(tmp_path: Path) -> None:
@@ -511,9 +509,7 @@ def test_a_file_in_millimetres_moves_as_one_in_metres(tmp_path: Path) -> None:
         scene = jointed().add("bead", sphere={"radius": radius}, position=(5, 0, 2))
         report = export(scene.save(tmp_path / "scene.yaml"), tmp_path / "out.xml")
         lines.append([line for line in report["left_out"] if "in mm" in line])
-        model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-        data = mujoco.MjData(model)
-        mujoco.mj_resetDataKeyframe(model, data, 0)
+        model, data = at_start(tmp_path / "out.xml")
         mujoco.mj_step(model, data, 100)  # before anything touches
         names = [body.name for body in jointed().load().bodies] + ["bead"]
         moved.append([(data.body(name).xpos.copy(), data.body(name).xmat.copy()) for name in names[1:]])
@@ -617,7 +613,7 @@ def test_usd_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
         change = Rotation.from_matrix(one.T @ two).as_rotvec()
         if joint.kind == "hinge":
             assert here == pytest.approx(there, abs=1e-6)
-            assert change == pytest.approx([start_positions(scene)[joint.name], 0, 0], abs=1e-6)
+            assert change == pytest.approx([STARTS[joint.name], 0, 0], abs=1e-6)
         elif joint.kind == "slider":
             assert one.T @ (there - here) == pytest.approx([0.1, 0, 0], abs=1e-6)
         elif joint.kind == "distance":
@@ -668,7 +664,7 @@ def test_gltf_joints_are_where_the_bodies_are(tmp_path: Path) -> None:
             far = [moved[along[0]]] if len(along) == 1 else [np.linalg.norm(moved[along])] if along else turned[about]
             assert all(limit["min"] - 1e-6 <= value <= limit["max"] + 1e-6 for value in far), name
         if name in ("shoulder", "elbow", "track"):
-            assert (turned + moved)[0] == pytest.approx(start_positions(scene)[name], abs=1e-6)
+            assert (turned + moved)[0] == pytest.approx(STARTS[name], abs=1e-6)
     shoulder, track, string = (found[name][2] for name in ("shoulder", "track", "string"))
     (swing,) = [limit for limit in shoulder["limits"] if limit.get("angularAxes") == [0]]
     assert (swing["min"], swing["max"]) == pytest.approx((math.radians(-30), math.radians(70)))
@@ -724,11 +720,8 @@ def test_recordings_show_axes_and_limits_where_they_are(tmp_path: Path) -> None:
 def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
     scene = load_scene(jointed().save(tmp_path / "scene.yaml"))
     report = export(tmp_path / "scene.yaml", tmp_path / "out.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out.xml"))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
-    for name, value in start_positions(scene).items():
+    model, data = at_start(tmp_path / "out.xml")
+    for name, value in STARTS.items():
         # The elbow has the arm first, so MuJoCo's goes from the arm to the forearm about the other way of its axis.
         assert data.joint(name).qpos[0] == pytest.approx(value, abs=1e-9), name
     for body in scene.bodies:
@@ -736,28 +729,11 @@ def test_exported_mjcf_has_the_same_joints_in_mujoco(tmp_path: Path) -> None:
         assert data.body(body.name).xpos == pytest.approx(body.position, abs=1e-9)
         if body.motion == "dynamic":
             centre = body.position + Rotation.from_quat(body.quat_xyzw).apply(body.scale * shape.com)
-            speed = np.zeros(6)
-            mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(body.name).id, speed, 0)
             assert data.body(body.name).xipos == pytest.approx(centre, abs=1e-9)
     assert float(model.joint("shoulder").damping[0]) == pytest.approx(0.2)
     assert model.joint("shoulder").range == pytest.approx(np.radians([-30, 70]))
     assert data.ctrl[0] == pytest.approx(0.4) and model.actuator_forcerange[0] == pytest.approx([-20, 20])
     assert data.ten_length[0] == pytest.approx(1.0) and model.tendon_range[0] == pytest.approx([0, 1.2])
-    # At other positions the arm is where the scene's joint puts it.
-    data.joint("shoulder").qpos[0] = 0.9
-    data.joint("elbow").qpos[0] = 0.3
-    mujoco.mj_forward(model, data)
-    post = next(body for body in scene.bodies if body.name == "post")
-    joint = next(joint for joint in scene.joints if joint.name == "shoulder")
-    own, theirs = (Rotation.from_quat(quat) for quat in joint.quat_xyzw)
-    axes = theirs * Rotation.from_rotvec([0.9, 0, 0]) * own.inv()
-    place = post.position + joint.anchor[1] - axes.apply(joint.anchor[0])
-    assert data.body("arm").xpos == pytest.approx(place, abs=1e-9)
-    assert data.body("arm").xmat.reshape(3, 3) == pytest.approx(axes.as_matrix(), abs=1e-9)
-    elbow = next(joint for joint in scene.joints if joint.name == "elbow")
-    arm, fore = (Rotation.from_matrix(data.body(name).xmat.reshape(3, 3)) for name in ("arm", "fore"))
-    frames = [turn * Rotation.from_quat(q) for turn, q in zip((arm, fore), elbow.quat_xyzw, strict=True)]
-    assert (frames[1].inv() * frames[0]).as_rotvec() == pytest.approx([0.3, 0, 0], abs=1e-9)
     assert not any("elbow" in line for line in report["left_out"])
 
 
@@ -798,10 +774,7 @@ def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: 
     scene, _ = imported(write(tmp_path, "robot.xml", COUPLED))
     simulator = Simulator(replace(scene, couplings=()))  # the keyframe is not where they hold
     simulator.reset(keyframe="home")
-    model = mujoco.MjModel.from_xml_string(COUPLED)
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
-    mujoco.mj_forward(model, data)
+    _, data = at_start(mujoco.MjModel.from_xml_string(COUPLED))
     for name in "abc":
         np.testing.assert_allclose(simulator[name].centre, data.body(name).xipos, atol=1e-8)
     np.testing.assert_allclose(simulator.frame("tcp").position, data.site("tcp").xpos, atol=1e-8)
@@ -818,9 +791,7 @@ def test_keyframes_sites_and_couplings_of_an_mjcf_are_those_of_mujoco(tmp_path: 
 
 def moving_alike(simulator: Simulator, model: mujoco.MjModel, key: int) -> None:
     """Whether bodies a, b and c are and move as in MuJoCo's keyframe."""
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, key)
-    mujoco.mj_forward(model, data)
+    _, data = at_start(model, key)
     for name in "abc":
         speed = np.zeros(6)
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, model.body(name).id, speed, 0)
@@ -879,9 +850,8 @@ def test_a_tendon_of_coupled_joints_is_a_motor_of_the_one_they_follow(tmp_path: 
       </actuator><keyframe><key name="start" qpos=".01 0" ctrl="10"/></keyframe></mujoco>"""
     scene, report = imported(write(tmp_path, "gripper.xml", text))
     assert not any("actuator" in line or "tendon" in line for line in report["left_out"] if "soft" not in line)
-    model, simulator = mujoco.MjModel.from_xml_string(text), Simulator(replace(scene, step=0.001))
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    simulator = Simulator(replace(scene, step=0.001))
+    model, data = at_start(mujoco.MjModel.from_xml_string(text))
     for time in (0.05, 0.05, 0.9):
         for _ in range(round(time / 0.0005)):
             mujoco.mj_step(model, data)
@@ -984,3 +954,95 @@ def test_a_fixed_joint_whose_file_gives_it_damping_holds_all_the_same(tmp_path):
     scene, report = imported(write(tmp_path / "damped", "arm.urdf", text))
     assert [joint.kind for joint in scene.joints] == [joint.kind for joint in plain.joints]
     assert "<dynamics> of fixed joints (1)" in report["left_out"]
+
+
+SCENE = """<mujoco><option>{option}</option><worldbody>
+  <geom name="ground" type="plane" size="1 1 1" {ground}/>
+  <body name="arm" pos="0 0 1"><joint name="j" axis="0 1 0" range="-20 20" limited="true" stiffness="3" damping="0.4"
+    frictionloss="0.2" {joint}/><geom name="rod" type="capsule" size="0.05" fromto="0 0 0 0.4 0 0" {rod}/></body>
+  <body name="ball" pos="2 0 0.1"><joint type="free" name="free" {free}/><geom name="round" size="0.1" {ball}/></body>
+  <body name="bob" pos="0.4 0 0.8"><freejoint/><geom name="bead" size="0.05"/></body>
+  </worldbody><equality><connect name="pin" body1="arm" body2="bob" anchor="0.4 0 0" {pin}/></equality>
+  <actuator><motor name="m" joint="j" {motor}/></actuator></mujoco>"""
+
+
+def text(**said: str) -> str:
+    places = dict.fromkeys(("option", "ground", "joint", "rod", "free", "ball", "pin", "motor"), "")
+    return SCENE.format(**places | said)
+
+
+def features(scene: Scene) -> dict[str, bool]:
+    joint = next(joint for joint in scene.joints if joint.name == "j")
+    return {
+        "gravity": bool(np.any(scene.gravity)),
+        "limit": joint.limits is not None,
+        "spring": joint.spring is not None,
+        "damper": joint.damping > 0,
+        "frictionloss": joint.friction > 0,
+        "equality": any(joint.name == "pin" for joint in scene.joints),
+        "contact": scene.effects.contact != "off",
+        "actuation": joint.motor is not None,
+    }
+
+
+@pytest.mark.parametrize("flag", ["gravity", "limit", "spring", "damper", "frictionloss", "equality", "contact",
+                                  "actuation", "constraint"])  # fmt: skip
+def test_what_a_flag_switches_off_is_off_and_nothing_else(tmp_path: Path, flag: str) -> None:
+    scene, report = imported(write(tmp_path, "scene.xml", text(option=f'<flag {flag}="disable"/>')))
+    off = ["limit", "frictionloss", "equality", "contact"] if flag == "constraint" else [flag]
+    assert features(scene) == {name: name not in off for name in features(scene)}
+    assert f"the file switches off (1: {flag})" in report["notes"]
+
+
+def test_flags_that_are_not_done_are_named(tmp_path: Path) -> None:
+    _, report = imported(
+        write(tmp_path, "scene.xml", text(option='<flag energy="enable" filterparent="disable" warmstart="disable"/>'))
+    )
+    named = next(line for line in report["left_out"] if line.startswith("flags of MuJoCo"))
+    assert all(flag in named for flag in ("energy enable", "filterparent disable", "warmstart disable"))
+
+
+@pytest.mark.parametrize(
+    ("said", "line"),
+    [
+        ({"rod": 'margin="0.01"'}, "margin and gap of geoms: bodies touch at their surface here (1: rod)"),
+        ({"ball": 'gap="0.01"'}, "margin and gap of geoms: bodies touch at their surface here (1: round)"),
+        ({"rod": 'solmix="2"'}, "(1: rod)"),
+        ({"ball": 'priority="1"'}, "priority and solmix of geoms"),
+        ({"ball": 'solimp="0.5 0.9 0.01"'}, "solimp of geoms: contacts are rigid here (1: round)"),
+        ({"ball": 'condim="6"'}, "friction against spinning and rolling (1: round)"),
+        ({"free": 'damping="0.1"'}, "damping, stiffness and friction of free joints (1: free)"),
+        ({"free": 'stiffness="0.1"'}, "damping, stiffness and friction of free joints (1: free)"),
+        ({"free": 'frictionloss="0.1"'}, "damping, stiffness and friction of free joints (1: free)"),
+        ({"joint": 'solreflimit="0.1 1"'}, "margin and softness of limits: they are rigid here (1: j)"),
+        ({"pin": 'solref="0.1 1"'}, "softness of equalities and tendons: they are rigid here (1: pin)"),
+        ({"motor": 'user="4"'}, "actuator_user of MuJoCo's model (1: m)"),
+        ({"option": '<flag gravity="enable"/>'}, ""),
+        ({"pin": 'active="false"'}, "equalities that are switched off (1: pin)"),
+    ],
+)
+def test_what_is_said_of_an_element_is_named(tmp_path: Path, said: dict[str, str], line: str) -> None:
+    plain = set(imported(write(tmp_path, "scene.xml", text()))[1]["left_out"])
+    assert plain == set()
+    left = imported(write(tmp_path, "scene.xml", text(**said)))[1]["left_out"]
+    assert (len(left) == 1 and line in left[0]) if line else not left
+
+
+def test_options_of_the_step_are_named_together(tmp_path: Path) -> None:
+    xml = text().replace("<option>", '<option timestep="0.004" cone="elliptic" wind="1 0 0">')
+    left = imported(write(tmp_path, "scene.xml", xml))[1]["left_out"]
+    assert left == ["air: density, viscosity and wind", "options of MuJoCo's step (2: cone, timestep)"]
+
+
+def test_a_body_slides_without_friction_if_all_of_its_contacts_do(tmp_path: Path) -> None:
+    scene, report = imported(
+        write(tmp_path, "scene.xml", text(ground='condim="1"', ball='condim="1"', rod='condim="1"'))
+    )
+    rough = {body.name: body.friction for body in scene.bodies}
+    # The bead has friction, so it and all that it may touch keep theirs; only what it never touches slides.
+    assert rough["ground"] > 0 and rough["ball"] > 0 and rough["bob"] > 0
+    assert any(note.startswith("friction of ") for note in report["notes"])
+    alone = text(ground='condim="1"', ball='condim="1"', rod='condim="1"').replace('"bead"', '"bead" condim="1"')
+    scene, report = imported(write(tmp_path, "scene.xml", alone))
+    assert all(body.friction == 0.0 for body in scene.bodies)
+    assert not any("friction of" in note for note in report["notes"])

@@ -12,7 +12,7 @@ from sdfsim.apps.play import opened, show
 from sdfsim.apps.play.session import Session
 from sdfsim.apps.run import read_run
 from sdfsim.physics import pose
-from tests.simulate.test_restore import same
+from tests.helpers.runs import same
 
 
 def tabletop(**settings) -> Scene:
@@ -302,21 +302,6 @@ def test_random_commands_end_without_an_error_or_an_unreported_broken_law():
 # --- the scene ---
 
 
-def test_without_friction_a_thing_slides_off():
-    scene = Scene(model="solver")
-    lean = np.radians(12)
-    scene.add("slope", plane={"normal": (np.sin(lean), 0, np.cos(lean))}, friction=1.0)
-    scene.add("cube", box={"size": (0.1, 0.1, 0.1)}, position=(0.05 * np.sin(lean), 0, 0.05 * np.cos(lean)),
-              euler_xyz_deg=(0, 12, 0), friction=0.8, restitution=0.0)  # fmt: skip
-    session = Session(Simulator(scene))
-    after(session, 0.5)
-    place = session.simulator["cube"].centre
-    session.set("cube", "friction", 0.0)
-    after(session, 0.5)
-    gone = np.linalg.norm(session.simulator["cube"].centre - place)
-    assert gone == pytest.approx(0.5 * 9.81 * np.sin(lean) * 0.25, rel=0.05)
-
-
 def test_added_bodies_lie_free_and_uploaded_meshes_become_bodies(session, tmp_path):
     spot = (0.0, 0.1, 0.55)
     names = [session.add("box", spot, box={"size": (0.1, 0.1, 0.1)}) for _ in range(3)]
@@ -353,20 +338,6 @@ def test_a_saved_scene_goes_on_as_it_was(session, tmp_path):
     np.testing.assert_allclose(again.si_state().velocity, session.simulator.si_state().velocity, atol=1e-12)
     again.step(20)
     session.step(20)
-    np.testing.assert_allclose(again.si_state().position, session.simulator.si_state().position, atol=2e-3)
-
-
-def test_a_saved_robot_keeps_its_joints(tmp_path):
-    session = Session(Simulator(arm()))
-    session.target("elbow", 0.8)
-    after(session, 1.0)
-    again = Simulator(load_scene(session.save_scene(tmp_path / "out")))
-    for name in ("shoulder", "elbow"):
-        mine, theirs = session.simulator.joint(name), again.joint(name)
-        assert theirs.angle == pytest.approx(mine.angle, abs=1e-4)
-        assert theirs.target == pytest.approx(mine.target) and theirs.max_force == mine.max_force
-    after(session, 0.5)
-    again.step(again.steps_in(0.5))
     np.testing.assert_allclose(again.si_state().position, session.simulator.si_state().position, atol=2e-3)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -20,12 +19,10 @@ from sdfsim.apps.recording import (
     save_reconstruction,
     save_rollout,
 )
-from sdfsim.geometry.mesh import Mesh
-from sdfsim.geometry.primitives import box, sphere
+from sdfsim.geometry.primitives import box
 from sdfsim.physics.rollout import Rollout
-from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.camera import Camera
-from sdfsim.simulate.looks import FARTHEST, framed, shown, with_normals
+from sdfsim.simulate.looks import FARTHEST, framed
 from tests.helpers.runs import read
 
 STEPS = 6
@@ -151,15 +148,6 @@ def test_nodes_contacts_and_forces_are_hidden_until_switched_on(scene, tmp_path,
     assert told.count("EntityBehavior:visible") >= 5
 
 
-def test_a_plot_with_nothing_to_show_is_not_there(scene, tmp_path, rollout):
-    for empty, kept in (((), ("network", "milliseconds")), (("nodes", "edges"), ("milliseconds", "contacts"))):
-        nothing = {key: np.zeros(STEPS + 1) for key in empty}
-        save_rollout(scene, replace(rollout, counters=rollout.counters | nothing), tmp_path / "rollout.rrd")
-        told = blueprint(tmp_path / "rollout.rrd")
-        views = re.findall(r"\[TimeSeries\] .*?\[(.+?)\]", told)
-        assert set(kept) <= set(views) and ("network" in views) == (not empty)
-
-
 def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_path):
     """A ball (2 m across) falls, while a brick (3 m) of whatever mass stands; then the brick is hit with ten times its
     weight, and later moves evenly aside while it is held up."""
@@ -181,38 +169,6 @@ def test_forces_are_weights_and_those_that_stand_still_are_marked(scene, tmp_pat
     np.testing.assert_allclose(arrows[3][0], hit, rtol=1e-5)
     np.testing.assert_allclose(found["/world/forces"]["Arrows3D:origins"][4][0], rollout.position[4, 3], rtol=1e-6)
     assert [len(row) for row in found["/world/still"]["Points3D:positions"]] == [0, 1, 1, 0, 0]
-
-
-def test_a_plane_lies_below_scenery_that_lies_in_it_and_stays_elsewhere(scene):
-    """So that a floor from photos, uneven by millimetres, does not flicker through the floor without end."""
-    for k, body in enumerate(scene.bodies):  # a brick of closed form beside it
-        if scene.shapes[body.shape].name == "plane":
-            assert (shown(scene, k, 9.0).vertices[:, 2] == 0.0).all()
-    rng = np.random.default_rng(0)
-    side = np.linspace(-2, 2, 30)
-    uneven = np.column_stack([np.stack(np.meshgrid(side, side), -1).reshape(-1, 2), rng.uniform(-0.01, 0.01, 900)])
-    at = np.arange(900).reshape(30, 30)[:-1, :-1].reshape(-1, 1)
-    faces = np.concatenate([at + np.array([0, 1, 31]), at + np.array([0, 31, 30])])
-    ground = replace(scene.shapes[1], mesh=Mesh(uneven, faces), sdf=load_shape("samples/shapes/bowl").sdf)
-    below = replace(scene, shapes=(scene.shapes[0], ground, *scene.shapes[2:]))
-    names = [shape.name for shape in scene.shapes]
-    assert names[0] == "plane" and names[1] == "brick"
-    below = replace(
-        below, bodies=tuple(replace(b, position=np.zeros(3)) if b.name == "shelf" else b for b in scene.bodies)
-    )
-    plane = shown(below, 0, 9.0)
-    corners = plane.vertices[plane.faces]
-    height, middle = corners[..., 2], corners.mean(1)
-    assert (np.ptp(height, axis=1) == 0.0).all()
-    inside = (np.abs(middle[:, :2]) < 1.9).all(1)
-    down = -height[inside]
-    assert inside.any() and (down == down[0, 0]).all() and (uneven[:, 2] + down[0, 0] > 0).mean() > 0.98
-    assert down[0, 0] < 0.05
-    # Where nothing lies in it, it is shown where bodies meet it; and all of it is there, with no gap between the two.
-    away = (np.abs(middle[:, :2]) > 2.3).any(1)
-    assert (height[away] == 0.0).all()
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    assert area[away].sum() + 4.6**2 >= 18.0**2 - 5.0 and area[height[:, 0] == 0.0].sum() < 18.0**2 - 3.8**2
 
 
 def test_a_reconstruction_shows_cameras_photos_points_and_surface(tmp_path):
@@ -242,19 +198,6 @@ def test_what_is_proposed_and_how_far_to_trust_the_surface_are_things_of_their_o
     assert found["/world/cameras/next1!"]["Pinhole:color"][0][0] == 0xFF28C8FF
     assert len(found[r"/world/trust/a\ box!"]["Mesh3D:vertex_colors"][0]) == 36
     assert "/world/surface!" in found
-
-
-def test_boxes_keep_their_edges_and_balls_stay_smooth():
-    mesh, normals = with_normals(box())
-    assert len(mesh.vertices) == 36
-    np.testing.assert_allclose(np.abs(normals).max(1), 1.0)
-    mesh, normals = with_normals(sphere())
-    np.testing.assert_allclose((normals * mesh.vertices).sum(1), 0.5, atol=1e-3)
-    colored = box()
-    colored = Mesh(colored.vertices, colored.faces, np.arange(24, dtype=np.uint8).reshape(8, 3))
-    mesh, _ = with_normals(colored)
-    assert mesh.colors is not None and colored.colors is not None
-    np.testing.assert_array_equal(mesh.colors[mesh.faces], colored.colors[colored.faces])
 
 
 def crowd(tmp_path, count: int, frames: int, name: str = "ball"):

@@ -99,7 +99,6 @@ def test_a_page_lives_as_long_as_its_command_without_a_terminal(tmp_path, comman
     root = Path(__file__).resolve().parents[2]
     with subprocess.Popen([sys.executable, "cli.py", *asked], cwd=root, stdin=subprocess.DEVNULL,
                           stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:  # fmt: skip
-        assert process.stderr is not None
         address = ""
         for line in process.stderr:
             address = line.split()[-1].partition("?")[0] if line.startswith("watch it at") else address

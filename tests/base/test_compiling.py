@@ -1,21 +1,16 @@
 """What is compiled is told before it is waited for: once, where it is not kept, and nothing else is said."""
 
 import importlib.util
-import os
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numba import typeof
+from numba.core import config
 
 from sdfsim.base import compiling
 from sdfsim.base.compiling import compile_before, is_compiled
-from sdfsim.physics.solver import prepare as solver
-from sdfsim.scene.scene import Joint, Scene
-from sdfsim.shape.make import analytic_shape
-from sdfsim.simulate.simulator import Simulator
-from tests.helpers.scenes import make_body
 
 SOURCE = "from numba import njit\n\n\n@njit(cache=True)\ndef double(x):\n    return 2 * x\n"
 
@@ -28,34 +23,8 @@ def loaded(file: Path):
     return module.double
 
 
-def test_a_function_is_compiled_where_numba_keeps_it_by_its_own_source(tmp_path, monkeypatch):
-    from numba.core import config
-
-    file = tmp_path / "doubling.py"
-    file.write_text(SOURCE)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
-    first = loaded(file)
-    assert not is_compiled(first)
-    assert first(3) == 6 and is_compiled(first)
-    again = loaded(file)
-    assert not again.signatures and is_compiled(again)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "other"))
-    assert not is_compiled(loaded(file))
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "one"))
-    copy = tmp_path / "elsewhere" / "doubling.py"
-    copy.parent.mkdir()
-    copy.write_text(SOURCE)
-    assert not is_compiled(loaded(copy))
-    file.write_text(SOURCE + "# another version\n")
-    os.utime(file, (1, 1))
-    assert not is_compiled(loaded(file))
-    assert is_compiled(loaded(copy).py_func)  # runs as Python
-
-
 @pytest.mark.parametrize("cache", ["True", "False"])
 def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, caplog, cache):
-    from numba.core import config
-
     (tmp_path / f"doubling_{cache}.py").write_text(SOURCE.replace("True", cache))
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
@@ -68,29 +37,8 @@ def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, cap
     assert (sum(double.stats.cache_hits.values()), len(double.stats.cache_misses)) == (1, 0) or cache == "False"
 
 
-def test_a_scene_compiles_the_pieces_that_it_needs(monkeypatch):
-    def asked(jobs, what):
-        names.append({function.py_func.__name__ for function, _ in jobs} - {"run_steps"})
-        raise InterruptedError
-
-    names: list[set[str]] = []
-    monkeypatch.setattr(solver, "compile_before", asked)
-    balls = [make_body(f"ball {k}", 0, [3 * k, 0, 1]) for k in range(solver.CROWD)]
-    pin = Joint("pin", "ball", (0, 1), np.array([[1.5, 0, 0], [-1.5, 0, 0]]), np.array([[0.0, 0, 0, 1]] * 2))
-    for bodies, joints in ((balls[:2], ()), (balls[:2], (pin,)), (balls, ())):
-        scene = Scene((analytic_shape("sphere", radius=0.5),), tuple(bodies), np.zeros(3), 1.0, joints=joints)
-        with pytest.raises(InterruptedError):
-            Simulator(scene, "solver").step()
-    few, jointed, many = names
-    assert few == {"near_solids", "collide_solids", "impact_solids", "solve_contacts"}
-    assert jointed == few - {"solve_contacts"} | {"solve_joints", "assemble"}
-    assert many == {"near_many", "collide_many", "impact_surfaces", "solve_many"}
-
-
 def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
     """Arrays of another layout need code of their own, which used to be compiled without a word."""
-    from numba.core import config
-
     (tmp_path / "layouts.py").write_text(SOURCE)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))

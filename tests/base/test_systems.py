@@ -1,4 +1,5 @@
-"""What Windows and macOS do otherwise, as far as Linux can try it: consoles, locks, paths, what is not there."""
+"""What Windows and macOS do otherwise, as far as Linux can try it: consoles, locks, paths; packages that are not
+there."""
 
 import ntpath
 import os
@@ -14,6 +15,7 @@ from sdfsim import Scene, SdfsimError, load_scene
 from sdfsim.apps.export import plain_names
 from sdfsim.base import files
 from sdfsim.base.files import path_from
+from sdfsim.base.lazy import NotInstalled, optional
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -63,3 +65,28 @@ def test_a_console_that_knows_few_characters_shows_the_others_escaped(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "\\u0432\\u0430\\u0437\\u0430 \\u2615" in done.stdout and "0 of 1 bodies rest" in done.stdout
+
+
+def test_a_missing_package_is_told_how_to_get(tmp_path):
+    with pytest.raises(NotInstalled, match="Gizmo is not installed") as error:
+        optional("gizmo_that_is_nowhere.part", "Gizmo", "bench")
+    assert error.value.hint == "pip install 'sdfsim[bench]'"
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ("raise ImportError('libGL.so.1: cannot open shared object file')", "ImportError: libGL.so.1: cannot open"),
+        ("import gears_that_are_nowhere", "ModuleNotFoundError: No module named 'gears_that_are_nowhere'"),
+        ("raise OSError('undefined symbol: mj_step')", "OSError: undefined symbol: mj_step"),
+        ("raise AttributeError('_ARRAY_API not found')", "AttributeError: _ARRAY_API not found"),
+    ],
+)
+def test_a_broken_package_is_told_with_its_own_error(tmp_path, monkeypatch, fault, told):
+    (tmp_path / "gizmo.py").write_text(fault)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "gizmo", raising=False)
+    with pytest.raises(NotInstalled) as error:
+        optional("gizmo", "Gizmo", "bench")
+    assert "Gizmo is installed, but does not load" in error.value.message and told in error.value.message
+    assert "not installed" not in error.value.message

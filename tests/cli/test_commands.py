@@ -1,10 +1,16 @@
-"""The command line from outside: exit codes, one line an error, one JSON object, run folders."""
+"""The command line from outside: exit codes, one line an error, one JSON object, run folders; commands that break or
+are broken off."""
 
 import json
 import os
+import re
+import signal
 import subprocess
 import sys
+import tomllib
 from dataclasses import replace
+from functools import partial
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +19,11 @@ import torch
 import yaml
 
 import cli
-from sdfsim import Rollout, load_scene
+from sdfsim import Rollout, SdfsimError, load_scene
+from sdfsim.apps import about
 from sdfsim.apps import run as runs
 from sdfsim.base.arguments import seconds_of
+from sdfsim.base.errors import run_main
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import write_ply
 from tests.helpers.command import SCENE, run
@@ -202,3 +210,126 @@ def test_the_version_is_the_package_s():
     import sdfsim
 
     assert run("--version").stdout == f"sdfsim {sdfsim.__version__}\n"
+
+
+def test_an_interrupt_that_a_library_turns_into_another_error_is_code_130_too(scene, monkeypatch):
+    def interrupted(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise TypeError("half imported") from None
+
+    monkeypatch.setattr("sdfsim.apps.plan.describe", interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background shells have it ignored
+    try:
+        done = run("plan", scene)
+        assert (done.exit_code, "internal" in done.stderr) == (130, False), done.stderr
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_tracebacks_only_with_v(scene, monkeypatch):
+    def fail(*arguments, **options):
+        raise ZeroDivisionError("a fault of ours")
+
+    monkeypatch.setattr("sdfsim.apps.plan.describe", fail)
+    plain, verbose = run("plan", scene), run("plan", scene, "-v")
+    assert plain.exit_code == verbose.exit_code == 1
+    assert "internal error: ZeroDivisionError" in plain.stderr and "Traceback" not in plain.stderr
+    assert "Traceback" in verbose.stderr
+
+
+def test_scripts_say_the_same_and_end_with_the_same_codes(capsys):
+    def fail(error: BaseException):
+        raise error
+
+    failed = SdfsimError("what is wrong", "what to try", exit_code=3)
+    for error, code in ((failed, 3), (SdfsimError("no hint"), 1), (KeyboardInterrupt(), 130)):
+        with pytest.raises(SystemExit) as end:
+            run_main(partial(fail, error))
+        assert end.value.code == code
+    assert capsys.readouterr().err == "error: what is wrong\nhint: what to try\nerror: no hint\n"
+    run_main(lambda: None)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("render", "MISSING", "-o", "x.png"),
+        ("identify", "MISSING.csv", "--scene", "SCENE"),
+        ("train", "--data", "MISSING", "-o", "x"),
+        ("import", "MISSING.urdf", "-o", "x.yaml"),
+        ("simulate", "MISSING.yaml", "-o", "x"),
+        ("export", "MISSING", "-o", "x.glb"),
+        ("view", "MISSING"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_is_not_there_is_told_in_plain_words_with_what_to_give(scene, tmp_path, words):
+    named = {"MISSING": str(tmp_path / "missing"), "SCENE": str(scene)}
+    given = [named.get(word, word.replace("MISSING", named["MISSING"])) for word in words]
+    done = run(*given)
+    told, *rest = done.stderr.strip().splitlines()
+    assert done.exit_code == 1 and told.startswith(f"error: {named['MISSING']}") and told.count(named["MISSING"]) == 1
+    assert "Errno" not in told and " no such " in told
+    assert len(rest) == 1 and rest[0].startswith("hint: ")
+
+
+def test_extras_are_those_of_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    optional = project["optional-dependencies"]
+    extras = {name: {re.split(r"[<>=]", one)[0] for one in listed} for name, listed in optional.items()}
+    for package, (extra, _) in about.EXTRAS.items():
+        assert package in extras[extra]
+    known = {re.split(r"[<>=]", one)[0] for one in project["dependencies"]}
+    assert set(about.NEEDED) <= known
+
+
+def test_what_is_not_installed_is_told_with_what_it_is_for(monkeypatch):
+    real = metadata.version
+
+    def version(name: str) -> str:
+        if name in ("usd-core", "mujoco", "xatlas", "pi-heif"):
+            raise metadata.PackageNotFoundError(name)
+        return real(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    report = json.loads(run("info", "--json").stdout)
+    assert report["versions"]["usd-core"] == "missing" and report["versions"]["torch"] == real("torch")
+    told = [line for line in report["missing"] if "pip install" in line]
+    assert told == [
+        "pi-heif: pip install pi-heif",
+        "xatlas: pip install xatlas",
+        "usd-core, for export of .usd: pip install 'sdfsim[export]'",
+        "mujoco, for import of MJCF, and comparisons with MuJoCo: pip install 'sdfsim[export]'",
+    ]
+    shown = run("info").stdout
+    assert all(f"not here: {line}" in shown for line in told) and "usd-core missing" not in shown
+
+
+@pytest.mark.parametrize(
+    ("why", "told"),
+    [
+        ("libGL.so.1: cannot open shared object file", "libGL.so.1, which open3d loads: apt-get install libgl1"),
+        ("libusb-1.0.so.0: cannot open", "libusb-1.0.so.0, which open3d loads: apt-get install libusb-1.0-0"),
+        ("DLL load failed\nwhile importing", "open3d does not load: DLL load failed while importing"),
+    ],
+)
+def test_a_library_of_the_system_that_is_missing_is_named_with_its_package(why, told):
+    assert about._unloaded("open3d", why) == told
+
+
+def test_the_systems_libraries_are_those_that_the_set_up_installs():
+    text = (ROOT / "scripts" / "setup.sh").read_text(encoding="utf-8")
+    pairs = dict(pair.split(":") for pair in re.findall(r"lib[\w.+-]+\.so[\w.]*:[\w.+-]+", text))
+    assert about.LIBRARIES.items() <= pairs.items()
+
+
+def test_info_goes_on_where_a_package_does_not_load():
+    code = (
+        "import sys; sys.modules['open3d'] = None\nfrom sdfsim.apps.about import about\n"
+        "print(*[line for line in about()['missing'] if 'open3d' in line])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("open3d does not load")

@@ -9,7 +9,7 @@ pytest.importorskip("pybullet")
 
 from sdfsim.data.dataset import Trajectory, trajectory_files
 from sdfsim.evaluation.engines import Start, bullet, dataset_urdf
-from sdfsim.evaluation.evaluate import evaluate, teacher_again
+from sdfsim.evaluation.evaluate import evaluate
 from tests.helpers.scenes import random_model
 
 
@@ -50,18 +50,6 @@ def test_free_fall_keeps_a_perturbation_as_it_is(falling):
     assert report["chaos_floor"]["median_farthest_unperturbed_m"] < 1e-9
     assert report["energy_gain"]["teacher"]["worst"] < 1e-9 and report["penetration"]["teacher"]["worst"] is None
     assert report["median_survival_s"]["teacher 1e-3"]["0.1"] is None
-
-
-def test_perturbations_repeat_and_have_the_size_they_are_named_by(cube_data):
-    trajectories = [Trajectory.load(f, as_recorded=True) for f in trajectory_files(cube_data, "test")]
-    one, two = (teacher_again(cube_data, trajectories, 20) for _ in range(2))
-    for a, b, t in zip(one["1e-3"], two["1e-3"], trajectories, strict=True):
-        np.testing.assert_array_equal(a.position, b.position)
-        np.testing.assert_allclose(np.linalg.norm(a.velocity[0] - t.velocity[0], axis=-1), 1e-3, rtol=1e-9)
-        assert len(a.position) == 21
-    np.testing.assert_array_equal(one["0"][0].position[0], trajectories[0].position[0])
-    other = teacher_again(cube_data, trajectories, 1, seed=1)
-    assert not np.array_equal(other["1e-3"][0].velocity[0], one["1e-3"][0].velocity[0])
 
 
 def test_the_recording_comes_back_before_chaos_grows(cube_data):

@@ -7,11 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from sdfsim.apps.run import summary
-from sdfsim.evaluation.instruments import in_order, judged, telling_frames
+from sdfsim.evaluation.instruments import judged, telling_frames
 from sdfsim.evaluation.true_surfaces import Gaps, Placed, gaps, true_surface
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh
@@ -150,23 +148,6 @@ def test_a_convex_mesh_with_sharp_edges_is_not_entered_from_beyond_them(radius: 
     np.testing.assert_allclose(found, truth, atol=2e-4)
 
 
-def test_boxes_are_as_far_apart_as_a_solver_of_quadratic_programs_says():
-    rng = np.random.default_rng(3)
-    size = np.array([0.5, 0.025, 0.025])
-    for _ in range(12):
-        turns, place = Rotation.random(2, rng=rng), rng.uniform(-0.4, 0.4, 3)
-
-        def apart(x: np.ndarray, turns=turns, place=place) -> float:
-            return float(np.square(turns[0].apply(x[:3]) - turns[1].apply(x[3:]) - place).sum())
-
-        limits = [(-half, half) for half in (*size, *size)]
-        found = minimize(apart, np.zeros(6), bounds=limits, method="L-BFGS-B", options={"ftol": 1e-16, "gtol": 1e-12})
-        wanted = np.sqrt(found.fun)
-        if wanted > 1e-3:
-            one = between(STICK, STICK, place, turns[1], other=turns[0])
-            assert one.apart[0] == pytest.approx(wanted, abs=3e-5)
-
-
 def test_a_torus_and_a_ball_are_measured_in_the_hole_too():
     torus, small = mesh(primitives.torus(0.35, 0.15, 192, 96)), analytic_shape("sphere", radius=0.05)
     rng = np.random.default_rng(1)
@@ -218,7 +199,6 @@ def crossing(apart: float) -> Scene:
 def test_sticks_in_each_other_are_told_with_their_depth():
     for depth in (0.001, 0.01, 0.02):
         verdict = judged(crossing(-depth), still(crossing(-depth)))
-        assert verdict.overlap is not None
         assert verdict.overlap.metres == pytest.approx(depth, rel=0.02)
         assert verdict.overlap.part == pytest.approx(depth / 0.05, rel=0.02)
         assert {verdict.overlap.first, verdict.overlap.second} == {"lower", "upper"}
@@ -237,14 +217,6 @@ def test_a_stick_that_passes_through_another_is_told_with_few_frames_measured():
     )
     assert shares == sorted(shares) and shares[-1] == 1.0
     assert told.frames < 10 and told.overlap is not None and told.overlap.part > 0.1
-
-
-def test_a_cube_that_sinks_into_a_thin_floor_is_told():
-    sheet = analytic_shape("box", size=(100.0, 100.0, 0.1))
-    sunk = make_body("cube", 1, [0.03, 0.02, 0.05 - 0.02])
-    scene = Scene((sheet, CUBE), (static("sheet", 0, [0, 0, -0.05]), sunk), G, 1.0)
-    verdict = judged(scene, still(scene))
-    assert verdict.overlap is not None and verdict.overlap.metres == pytest.approx(0.02, rel=0.01)
 
 
 def test_bodies_that_may_not_touch_may_be_in_each_other():
@@ -279,7 +251,6 @@ SLAB = mesh(primitives.box((4.0, 4.0, 0.2)))
 @pytest.mark.parametrize("gap", [0.003, 0.014, 0.03])
 def test_a_ball_that_rests_on_air_is_told_with_its_gap(gap):
     verdict = judged(above(SLAB, gap), still(above(SLAB, gap)))
-    assert verdict.floating is not None
     assert verdict.floating.metres == pytest.approx(gap, rel=0.05)
     assert (verdict.floating.first, verdict.floating.second) == ("ball", "slab")
     assert verdict.broken[0].startswith("floating: 'ball'")
@@ -309,32 +280,6 @@ def test_gravity_may_act_for_longer_only_after_a_touch(hits, told):
     assert (judged(scene, motion(scene, place, velocity)).floating is not None) == told
 
 
-def test_what_falls_or_bounces_is_not_held():
-    """A ball in free flight that bounces with e = 0.8 within steps: its parabolas are exact."""
-    scene, speed, height = above(SLAB, 0.3), 0.0, 0.3
-    heights, speeds = [height], [speed]
-    for _ in range(150):
-        left = DT
-        while True:
-            hit = (speed + np.sqrt(speed**2 + 2 * 9.81 * height)) / 9.81
-            if hit > left:
-                break
-            speed, height, left = 0.8 * (9.81 * hit - speed), 0.0, left - hit
-            if speed < 0.05:
-                break
-        height, speed = height + speed * left - 0.5 * 9.81 * left**2, speed - 9.81 * left
-        if speed < 0 and height < 1e-3:
-            break
-        heights.append(height)
-        speeds.append(speed)
-    place = np.broadcast_to(np.stack([b.position for b in scene.bodies]), (len(heights), 2, 3)).copy()
-    place[:, 1, 2] += np.array(heights) - 0.3
-    velocity = np.zeros_like(place)
-    velocity[:, 1, 2] = speeds
-    verdict = judged(scene, motion(scene, place, velocity))
-    assert verdict.floating is None and verdict.broken == ()
-
-
 def test_a_ball_that_turns_back_before_it_touches_is_told():
     small = mesh(primitives.sphere(0.1, 4))
     big = analytic_shape("sphere", radius=0.21)
@@ -345,7 +290,6 @@ def test_a_ball_that_turns_back_before_it_touches_is_told():
     velocity = np.zeros_like(place)
     velocity[:, 1, 0] = np.where(np.arange(len(x)) <= 15, 0.2, -0.2)
     verdict = judged(scene, motion(scene, place, velocity))
-    assert verdict.floating is not None
     assert verdict.floating.metres == pytest.approx(0.02, abs=2e-3)
 
 
@@ -412,15 +356,6 @@ def test_a_gain_of_one_among_others_that_lose_is_told_by_name():
     assert verdict.energy.body == "can" and "'can'" in verdict.broken[-1]
 
 
-def test_a_body_that_leaves_with_energy_it_never_had_is_told():
-    scene = Scene((CUBE,), (make_body("cube", 0, [0, 0, 0]),), np.zeros(3), 1.0)
-    t = DT * np.arange(200)
-    velocity = np.zeros((200, 1, 3))
-    velocity[:, 0, 0] = 0.1 + 0.05 * t  # a steady push of nobody
-    place = np.cumsum(velocity, 0) * DT
-    assert "energy from nothing" in judged(scene, motion(scene, place, velocity)).broken[-1]
-
-
 def test_exchange_between_two_bodies_is_no_gain_of_one():
     scene = Scene((BALL,), (make_body("a", 0, [-0.5, 0, 0]), make_body("b", 0, [0.25, 0, 0])), np.zeros(3), 1.0)
     place, velocity = np.zeros((51, 2, 3)), np.zeros((51, 2, 3))
@@ -460,13 +395,6 @@ def test_pulls_and_pushes_through_the_library_are_accounted_for():
 # --- the rest ---
 
 
-def test_frames_are_looked_at_from_the_coarse_to_the_fine_each_once():
-    assert list(in_order(0)) == [] and list(in_order(1)) == [0]
-    for count in (2, 5, 64, 1000):
-        order = list(in_order(count))
-        assert sorted(order) == list(range(count)) and order[:2] == [count - 1, 0]
-
-
 def test_little_time_measures_few_frames_and_the_last():
     place = np.zeros((2000, 2, 3))
     place[:, :] = np.stack([b.position for b in crossing(0.02).bodies])
@@ -489,20 +417,3 @@ def test_a_fault_at_the_start_or_after_an_impact_is_told_without_any_time(hit: i
     verdicts = [judged(scene, rollout, seconds=0.0) for _ in range(2)]
     assert verdicts[0] == verdicts[1] and verdicts[0].frames == len(telling_frames(scene, rollout))
     assert verdicts[0].overlap is not None and verdicts[0].overlap.at_s == pytest.approx(DT * hit)
-
-
-def test_few_frames_are_told_apart_whatever_happens():
-    scene = crossing(0.02)
-    for count in (1, 2, 3, 50, 2000):
-        place = np.broadcast_to(np.stack([b.position for b in scene.bodies]), (count, 2, 3)).copy()
-        velocity = np.random.default_rng(0).normal(size=place.shape)
-        found = telling_frames(scene, motion(scene, place, velocity))
-        assert len(found) == len(set(found)) <= 8 and {0, count - 1} <= set(found)
-
-
-def test_a_report_has_what_the_instruments_say():
-    scene = above(SLAB, 0.014)
-    report = summary(scene, still(scene), 1.0)
-    assert report["floating"]["metres"] == pytest.approx(0.014, rel=0.05)
-    assert report["overlap"] is None and report["energy_from_nothing"]["climb"] == 0
-    assert [line.split(":")[0] for line in report["broken_laws"]] == ["floating"]

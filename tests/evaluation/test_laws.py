@@ -1,5 +1,9 @@
 """The table of laws: all checks hold but those that are listed, and none of them has gone."""
 
+import runpy
+from collections import Counter
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -68,3 +72,18 @@ def test_every_law_has_a_name_of_its_own_and_the_short_form_is_shorter():
     names = [[law.name for law in laws(quick=quick)] for quick in (False, True)]
     assert len(set(names[0])) == len(names[0]) and set(names[1]) < set(names[0])
     assert len(ROWS) == sum(map(len, (EVERYDAY, TEXTBOOK, JOINTS, ASSEMBLY)))
+
+
+ROOT = Path(__file__).resolve().parents[2]
+SOLVER = ROOT / "sdfsim" / "physics" / "solver"
+FAULTS = runpy.run_path(str(ROOT / "scripts" / "seeded_faults.py"))["FAULTS"]
+
+
+def test_each_fault_replaces_what_is_there_once_and_names_laws_of_the_table():
+    assert len(FAULTS) >= 20 and max(Counter(one.name for one in FAULTS).values()) == 1
+    known = {law.name for law in laws()}
+    for one in FAULTS:
+        text = (SOLVER / one.file).read_text(encoding="utf-8")
+        for right, wrong in one.edits:
+            assert text.count(right) == 1 and right != wrong, one.name
+        assert set(one.laws.split()) <= known, one.name

@@ -10,7 +10,7 @@ import torch
 
 from benchmarks.hard_cases import accepted, slipped_back
 from sdfsim.apps import stress as study
-from sdfsim.apps.stress import losses, rows, table, write_report
+from sdfsim.apps.stress import rows, table, write_report
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_json
 from sdfsim.evaluation import harness
@@ -80,13 +80,6 @@ def test_what_is_finished_is_kept_and_what_changed_is_run_again(tmp_path, model,
     assert sorted(few) == [(case, "untrained") for case in FEW], "the teacher is as it was"
 
 
-def test_the_solver_takes_part(tmp_path, model):
-    found = run(tmp_path / "out", "solver", model)
-    assert found.who == ["solver", "untrained", "teacher"]
-    assert {case for case, who in found.results if who == "solver"} == set(FEW)
-    assert losses(found)["solver"] == {"figures": 3, "missed": 0, "behind the teacher": 0, "cases that blew up": 0}
-
-
 def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path, model, monkeypatch):
     found = run(tmp_path / "out", model)
     head, *shown = rows(found, {})
@@ -107,13 +100,6 @@ def test_the_table_has_a_row_for_every_figure_and_says_what_was_not_run(tmp_path
 
     monkeypatch.setattr(study, "import_pybullet", absent)
     assert run(tmp_path / "alone", model).who == ["untrained"]
-
-
-def test_the_cases_of_a_row_are_drawn(tmp_path, model, monkeypatch):
-    monkeypatch.setattr(study, "laws", lambda **_: shortened("thin-5", "thin-20"))
-    found = run(tmp_path / "out", model)
-    assert "plots/thin.png" in Path(write_report(found, tmp_path / "out")["table"]).read_text()
-    assert (tmp_path / "out" / "plots" / "thin.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def broken(model: str) -> str:

@@ -13,13 +13,10 @@ from scipy.spatial.transform import Rotation
 from benchmarks.tosses import (
     A_CUBE,
     ENGINES,
-    FIT,
     FRAMES,
     OURS,
     SIDE,
-    TEST,
     Motion,
-    drawn,
     errors,
     ours,
     recorded,
@@ -35,13 +32,6 @@ VALUES = {
 }  # fmt: skip
 NAMES = [OURS, *(name for name in ENGINES if name != "Drake" or importlib.util.find_spec("pydrake"))]
 SPIN = np.array([1.0, 2.0, 3.0])
-
-
-@pytest.fixture(scope="module")
-def folder(data_dir) -> Path:
-    if not (data_dir / "tosses" / "cube.npz").is_file():
-        pytest.skip(f"recorded tosses are not at {data_dir / 'tosses'} (set SDFSIM_DATA)")
-    return data_dir / "tosses"
 
 
 def thrown(velocity, angular, *, frames: int = 100, height: float = 0.15) -> Links:
@@ -126,20 +116,3 @@ def test_tosses_side_by_side_meet_the_table_alone(name, tmp_path):
     assert np.abs(together.position[1] - alone.position[0]).max() < 1e-6
     lies = 0.5 * SIDE * np.abs(Rotation.from_quat(alone.quat_xyzw[0, -1, 0]).as_matrix()[2]).sum()
     assert alone.position[0, -1, 0, 2] == pytest.approx(lies, abs=3e-3)  # it has come down
-
-
-def test_recorded_tosses_fly_as_their_authors_say_and_are_split_apart(folder, tmp_path):
-    """Their velocities are smoothed differences, in the world's frame."""
-    dt, tosses = A_CUBE.tosses(folder)
-    usable = [(toss, r) for toss, r in A_CUBE.begun(tosses, dt, A_CUBE.load(tmp_path)) if len(toss.position) > FRAMES]
-    with np.load(folder / "cube.npz") as told:
-        rows = told["start"][:-1][[int(r.name) for _, r in usable]]
-        velocity, angular = told["velocity"][rows + 3], told["angular_velocity"][rows + 3]
-    then = np.array([r.velocity[0, 0] - [0.0, 0.0, 3 * DT * GRAVITY] for _, r in usable])
-    turning = np.array([r.angular_velocity[0, 0] for _, r in usable])
-    assert np.median(np.linalg.norm(then - velocity, axis=1)) < 0.03
-    assert np.median(np.linalg.norm(turning - angular, axis=1)) < 0.3
-    fit, test, rest = drawn(usable)
-    assert (len(fit), len(test)) == (FIT, TEST)
-    every = [toss for toss, _ in (*fit, *test, *rest)]
-    assert len({toss.position.tobytes() for toss in every}) == len(every) > 300

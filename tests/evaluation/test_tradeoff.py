@@ -11,27 +11,15 @@ import torch
 pytest.importorskip("pybullet")
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.data.batching import every, first_frames
 from sdfsim.evaluation import tradeoff as study
-from sdfsim.evaluation.tradeoff import Variant, arranged, cases_of_scene, load_cases, variants
-from sdfsim.learned.model import load_model
-from sdfsim.physics.motion import MOTION
+from sdfsim.evaluation.tradeoff import Variant, arranged, load_cases
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import with_sdf
-from tests.helpers.scene_files import SCENE
 
 
 @pytest.fixture(scope="module")
 def cases(cube_data):
     return load_cases(cube_data, quick=True)
-
-
-def test_every_setting_has_a_label_of_its_own():
-    for quick in (False, True):
-        chosen = variants(["solver", "gnn"], quick=quick)
-        assert len({s.label for s in chosen}) == len(chosen) and not any("/" in s.label for s in chosen)
-        assert chosen[0] == Variant("solver") and Variant("gnn") in chosen and chosen[-1].label == "ballistic"
-        assert {s.nodes for s in variants(["solver"], quick=quick, nodes=False)} == {"own"} != {s.nodes for s in chosen}
 
 
 def test_networks_and_shapes_are_what_a_setting_says(cases):
@@ -42,33 +30,6 @@ def test_networks_and_shapes_are_what_a_setting_says(cases):
     assert len(few) == 10 and (np.abs(np.abs(few) - [0.5, 0.3, 0.2]).max(1) < 1e-9).sum() == 8
     grid = arranged(Variant("solver", nodes="grid 6"), cases)["box"].nodes
     assert 8 <= len(grid) <= 6**3 and np.abs(np.asarray(box.sdf(grid)[0])).max() < 0.01
-
-
-def test_a_scene_is_judged_by_the_teacher_in_the_model_s_units(tmp_path):
-    from sdfsim.scene.load import load_scene
-
-    (tmp_path / "scene.yaml").write_text(SCENE)
-    cases = cases_of_scene(load_scene(tmp_path / "scene.yaml"), "gnn", tmp_path / "engine", quick=True)
-    assert cases.length == pytest.approx(0.1 / load_model("gnn").length, rel=0.02)
-    assert cases.steps == min(50, round(0.4 / cases.time / 0.02)) and cases.floor == (0.8, 0.5)
-    (recorded,) = cases.recorded
-    t = np.arange(len(recorded.position)) * recorded.dt * cases.time
-    path = np.array([3.0, 0.0, 8.5]) + np.outer(t, [1.0, 0, 0]) + 0.5 * np.outer(t * t, [0, 0, -9.81])
-    assert np.abs(cases.length * recorded.position[:, 1] - path).max() < 1e-4
-
-
-@pytest.mark.parametrize(("steps", "stride"), [(60, 1), (60, 2), (61, 2), (30, 2), (31, 2)])
-def test_half_as_many_steps_are_judged_over_the_same_time(cases, steps, stride):
-    """A motion that drifts from its recording at a constant speed has the errors of that speed."""
-    recorded = [replace(t, **{name: np.repeat(getattr(t, name)[:1], 62, 0) for name in MOTION}) for t in cases.recorded]
-    few = replace(cases, recorded=[first_frames(t, steps + 1) for t in recorded])
-    drift = 0.01 * np.arange(steps + 1)[:, None, None] * [1.0, 0, 0]
-    motions = [every(replace(t, position=t.position + drift), stride) for t in few.recorded]
-    found = study._judged(motions, few, stride)["translation_rmse"]
-    assert list(found) == sorted({str(min(50, steps)), str(steps)}, key=int)
-    for horizon, error in found.items():
-        at = 0.01 * stride * np.arange(1, int(horizon) // stride + 1)
-        assert error == pytest.approx(np.sqrt((at**2).mean()), rel=1e-6)
 
 
 def test_the_whole_study_in_small(cube_data, tmp_path, monkeypatch):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
@@ -77,7 +78,6 @@ def test_a_binary_ply_of_triangles_and_quads_is_read(tmp_path: Path, order: str,
     path.write_bytes(binary_ply(order, texcoords=texcoords))
     mesh = load_mesh(path)
     check_block(mesh)
-    assert mesh.colors is not None
     for vertex, color in zip(mesh.vertices, mesh.colors, strict=True):
         assert color.tolist() == [10 * PLACES.index(tuple(np.round(vertex).tolist())), 100, 200]
 
@@ -114,8 +114,6 @@ def test_a_text_ply_with_lists_of_unlike_lengths_is_read(tmp_path: Path) -> None
 
 
 def test_a_texture_that_a_ply_names_colours_its_vertices(tmp_path: Path) -> None:
-    from PIL import Image
-
     image = np.zeros((8, 8, 3), dtype=np.uint8)
     image[:4, :] = (250, 20, 30)  # the upper half, which PLY counts as v > 0.5
     Image.fromarray(image).save(tmp_path / "paint.png")
@@ -459,8 +457,6 @@ def test_a_buffer_that_only_an_extension_fills_is_reported(tmp_path: Path) -> No
 
 
 def test_colours_of_a_gltf_are_multiplied_as_light(tmp_path: Path) -> None:
-    from PIL import Image
-
     image = np.zeros((2, 2, 3), dtype=np.uint8)
     image[0, 1] = (255, 255, 0)  # upper right
     png = io.BytesIO()

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-import sdfsim
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
 from sdfsim.scene.scene import Body, Scene
@@ -73,18 +72,6 @@ def unequal() -> Scene:
     scene = placed(CUBE, [(0, 0, 0.5), (0.1, 0, 1.55)], floor=True)
     light, heavy, floor = scene.bodies
     return replace(scene, bodies=(light, replace(heavy, mass=1000.0), floor))
-
-
-def in_bowl(count: int) -> Scene:
-    """So many balls into the sample's bowl, in columns above it."""
-    scene = sdfsim.load_scene(SAMPLES / "spheres_in_bowl.yaml")
-    like = next(b for b in scene.bodies if b.motion == "dynamic")
-    spots = [(0.09 * x, 0.09 * y) for x in (-1, 0, 1) for y in (-1, 0, 1)]
-    balls = [
-        replace(like, name=f"ball {k}", position=np.array([*spots[k % 9], 0.4 + 0.09 * (k // 9)]) + 0.003 * (k % 5))
-        for k in range(count)
-    ]
-    return replace(scene, bodies=(*(b for b in scene.bodies if b.motion == "static"), *balls))
 
 
 CASES: dict[str, Callable[[], Scene]] = {

@@ -88,7 +88,6 @@ def check_is_what_it_says(scene: Scene, document: dict) -> None:
                 turn = Rotation.from_euler("xyz", entry["euler_xyz_deg"], degrees=True)
                 assert (turn * Rotation.from_quat(body.quat_xyzw).inv()).magnitude() < 1e-9
             if "path" in entry:
-                assert body.path is not None
                 assert body.path.position.tolist() == [pose["position"] for pose in entry["path"]]
             elif "plane" in entry:
                 normal = Rotation.from_quat(body.quat_xyzw).apply([0, 0, 1])

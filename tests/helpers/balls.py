@@ -8,6 +8,7 @@ from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from pipeline.cameras import PosedPhotos, Sparse, View
+from tests.helpers.surfaces import box, look_at
 
 Distance = Callable[[np.ndarray], np.ndarray]
 BALL, GROUND = 0.35, -0.35  # radius of the ball about the origin, and height of the plane below it
@@ -38,25 +39,12 @@ def cup(radius: float, wall: float, depth: float, height: float) -> Distance:
 def crate(sides: tuple[float, float], wall: float, depth: float, height: float) -> Distance:
     """The same for a box with these sides, hollow from its rim down by `depth`, on a plane."""
 
-    def box(points: np.ndarray, half: list[float], middle: float) -> np.ndarray:
-        beyond = np.abs(points - [0, 0, middle]) - half
-        return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
-
     def distance(points: np.ndarray) -> np.ndarray:
-        outside = box(points, [0.5 * sides[0], 0.5 * sides[1], height / 2 + 0.02], height / 2)
-        hollow = box(points, [0.5 * sides[0] - wall, 0.5 * sides[1] - wall, depth], height)
+        outside = box(points, (0, 0, height / 2), (0.5 * sides[0], 0.5 * sides[1], height / 2 + 0.02))
+        hollow = box(points, (0, 0, height), (0.5 * sides[0] - wall, 0.5 * sides[1] - wall, depth))
         return np.minimum(np.maximum(outside, -hollow), points[..., 2])
 
     return distance
-
-
-def camera(name: str, place: np.ndarray, target: np.ndarray, width: int, height: int, focal: float) -> View:
-    """A level camera, z up."""
-    forward = (target - place) / np.linalg.norm(target - place)
-    right = np.cross(forward, [0.0, 0, 1])
-    right /= np.linalg.norm(right)
-    turn = np.stack([right, np.cross(forward, right), forward])
-    return View(name, name, width, height, focal, width / 2, height / 2, 0.0, turn, -turn @ place)
 
 
 def true_depth(view: View, distance: Distance, far: float = 8.0) -> np.ndarray:
@@ -121,5 +109,5 @@ def ring(count: int, radius: float, elevation: float, width: int, height: int, f
     for k in range(count):
         turn = 2 * np.pi * (k + 0.5 * (start % 2)) / count
         away = radius * np.array([np.cos(tilt) * np.cos(turn), np.cos(tilt) * np.sin(turn), np.sin(tilt)])
-        found.append(camera(f"{start + k:03d}.png", np.array(target) + away, np.array(target), width, height, focal))
+        found.append(look_at(target + away, target, name=f"{start + k:03d}.png", size=(width, height), focal=focal))
     return found

@@ -1,5 +1,6 @@
 """Shapes: made up, and bundled."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Frame, Mesh
 from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.shape.make import mesh_shape
 from sdfsim.shape.shape import Shape
 
 
@@ -37,3 +39,14 @@ def fitted() -> Shape:
 
 
 SHAPES = Path(__file__).resolve().parents[2] / "samples" / "shapes"
+
+
+def joined(name: str, boxes: list[tuple[tuple, tuple]], *, pieces: bool) -> Shape:
+    """A body made of boxes, given by their lowest and highest corners; with these as convex pieces, or as a surface."""
+    parts = [primitives.box(np.subtract(high, low)) for low, high in boxes]
+    parts = [
+        Mesh(part.vertices + np.add(low, high) / 2, part.faces) for part, (low, high) in zip(parts, boxes, strict=True)
+    ]
+    faces = np.concatenate([part.faces + 8 * k for k, part in enumerate(parts)])
+    whole = mesh_shape(Mesh(np.concatenate([part.vertices for part in parts]), faces), name=name, kind="mesh")
+    return replace(whole, pieces=tuple(part.vertices for part in parts)) if pieces else whole

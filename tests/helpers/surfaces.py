@@ -14,13 +14,13 @@ def cube(size: float = 1.0, center=(0.0, 0, 0)) -> Mesh:
     return Mesh(np.asarray(made.vertices) + center, np.asarray(made.faces, np.int64))
 
 
-def look_at(eye, target=(0.0, 0, 0), up=(0.0, 0, 1)) -> View:
+def look_at(eye, target=(0.0, 0, 0), up=(0.0, 0, 1), *, name="a", size=(640, 480), focal=600.0) -> View:
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return View("a", "a", 640, 480, 600.0, 320.0, 240.0, 0.0, rotation, -rotation @ np.asarray(eye, float))
+    return View(name, name, *size, focal, size[0] / 2, size[1] / 2, 0.0, rotation, -rotation @ np.asarray(eye, float))
 
 
 def ring(count: int = 12, height: float = 1.0, radius: float = 3.0) -> list[View]:
@@ -58,7 +58,7 @@ WALL = 0.035
 
 def box(points: np.ndarray, center, half) -> np.ndarray:
     q = np.abs(points - np.asarray(center)) - np.asarray(half)
-    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+    return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0)
 
 
 def cup(points: np.ndarray, at=(0.1, -0.05), radius: float = 0.12, height: float = 0.3) -> np.ndarray:

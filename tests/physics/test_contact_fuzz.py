@@ -17,9 +17,9 @@ from sdfsim.physics.solver.convex import Convex, Pair, closest, outermost, simpl
 from sdfsim.physics.solver.prepare import _packed
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf
 from sdfsim.shape.convex_pieces import ConvexPiece, closed_form, hull
-from tests.reference.solids import KINDS, Solid, is_sharp, least_depth, overlap, placed, views, width
+from tests.reference.solids import KINDS, Solid, across, is_sharp, least_depth, overlap, placed, views, width
 
-BLOCK, BLOCKS, MANY = 500, 6, 200  # pairs of a test; tests of the fast suite, and of both: 3,000 and 100,000 pairs
+BLOCK, BLOCKS, MANY = 500, 3, 200  # pairs of a test; tests of the fast suite, and of both: 1,500 and 100,000 pairs
 GAPS = (0.0, 1e-6, 1e-3, 0.1, 1.0, -1e-6, -1e-3, -1e-2, -3e-2)  # of the smaller thickness
 REACH = 0.015  # of the smaller body: points are told of gaps up to here
 FORMS = {"sphere": SphereSdf, "capsule": CapsuleSdf, "cylinder": CylinderSdf, "cone": ConeSdf}
@@ -192,9 +192,7 @@ def faults(case: Case) -> list[str]:
 
 
 def _square(n: np.ndarray) -> np.ndarray:
-    u = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.6 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    w = np.cross(n, u)
+    u, w = across(n)
     return np.stack([u + w, w - u, -u - w, u - w])
 
 
@@ -226,24 +224,6 @@ def test_the_farthest_corner_of_a_hull_is_found_among_all(count):
     for d in draw.normal(size=(200, 3)):
         found = outermost_of(convex, tuple(d.tolist()))
         assert convex.vertex[found] @ d == pytest.approx((convex.vertex @ d).max(), abs=1e-12)
-
-
-def test_the_truth_of_overlaps_is_that_of_the_whole_difference_of_two_solids():
-    """The judge itself: depths by faces and edges against the hull of all differences of corners."""
-    draw, judged = np.random.default_rng(0), 0
-    for seed in range(400):
-        case = drawn(seed)
-        a, b = case.solids()
-        if not {a.kind, b.kind} <= {"box", "hull"} or len(a.core) * len(b.core) > 2000:
-            continue
-        middle = a.core.mean(0) - b.core.mean(0)
-        offset = case.offset - middle + 0.3 * min(a.thickness, b.thickness) * draw.uniform(-1, 1, 3)
-        a, b = case._replace(offset=offset).solids()
-        truth = ConvexHull((a.core[:, None] - b.core[None]).reshape(-1, 3)).equations[:, 3].max()
-        assert truth < 0
-        assert least_depth(a, b)[0] == pytest.approx(truth, abs=1e-7 * max(a.extent, b.extent))
-        judged += 1
-    assert judged > 50
 
 
 def fcl_shape(kind: str, sizes: np.ndarray, scale: float) -> fcl.CollisionGeometry:

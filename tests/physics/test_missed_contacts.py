@@ -1,11 +1,9 @@
-"""Pairs of bodies that just touch, put into scenes of two: does a step tell the contact?
-
-Where they touch is found on their true surfaces alone (`true_surfaces`), which know nothing of the contact search.
-"""
+"""Pairs of bodies that just touch, put into scenes of two: does a step tell the contact? Where they touch is found on
+their true surfaces alone (`true_surfaces`), which know nothing of the contact search. And bodies that slide from one
+support to the next: seams and gaps at equal height are no walls, everything else is."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import combinations_with_replacement
 
@@ -13,16 +11,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sdfsim import Simulator
+from sdfsim import Rollout, Simulator
 from sdfsim.evaluation.true_surfaces import Placed, TrueSurface, gaps, true_surface
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.scene.builder import SceneBuilder
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.baked_grid import baked
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.shape.shape import Shape, load_shape, with_sdf
 from tests.helpers.scenes import make_body as body
-from tests.helpers.shapes import SHAPES
+from tests.helpers.shapes import SHAPES, joined
 
 CONVEX = ("box", "stick", "plate", "sphere", "capsule", "cylinder", "disc", "hull", "cube mesh", "ball mesh")
 HOLLOW = ("ring", "bowl", "can", "torus mesh", "gear mesh", "bowl mesh")
@@ -136,17 +135,6 @@ def test_a_step_tells_every_contact(kinds, count, least):
     assert asked > least and not wrong, f"{len(wrong)} of {asked}:\n" + "\n".join(wrong[:10])
 
 
-def joined(name: str, boxes: list[tuple[tuple, tuple]], *, pieces: bool) -> Shape:
-    """A body made of boxes, given by their lowest and highest corners; with these as convex pieces, or as a surface."""
-    parts = [primitives.box(np.subtract(high, low)) for low, high in boxes]
-    parts = [
-        Mesh(part.vertices + np.add(low, high) / 2, part.faces) for part, (low, high) in zip(parts, boxes, strict=True)
-    ]
-    faces = np.concatenate([part.faces + 8 * k for k, part in enumerate(parts)])
-    whole = mesh_shape(Mesh(np.concatenate([part.vertices for part in parts]), faces), name=name, kind="mesh")
-    return replace(whole, pieces=tuple(part.vertices for part in parts)) if pieces else whole
-
-
 LOW = ((0.4, -0.3, 0.0), (1.0, 0.3, 0.8))  # a block that is lower than the one beside it
 LEG = ((0.2, -0.05, 0.5), (0.3, 0.05, 1.01))  # of a hook that hangs down in front of the low block
 
@@ -223,3 +211,133 @@ def test_bodies_of_several_pieces_do_not_pass_into_each_other():
             )
     assert len(met) > 10  # of 20 pairs
     assert worst < 0.01
+
+
+NEAR = ((-1.0, -0.3, -0.1), (0.0, 0.3, 0.0))  # a support whose top is at height 0 and that ends at x = 0
+APART = ((-0.05, -0.05, -1.05), (0.05, 0.05, -0.95))  # a piece that touches nothing
+BOX = [((-0.3, -0.15, 0.0), (0.3, 0.15, 0.1))]
+DESK = [((-0.3, -0.15, 0.06), (0.3, 0.15, 0.1))]
+DESK += [((x, -0.15, 0.0), (x + 0.1, 0.15, 0.06)) for x in (-0.3, 0.2)]
+
+
+def far(gap: float, height: float = 0.0) -> tuple[tuple, tuple]:
+    """The next support, after a gap, and that much higher."""
+    return ((gap, -0.3, -0.1), (gap + 1.0, 0.3, height))
+
+
+def slid(floor: list[tuple[Shape, np.ndarray]], it: Shape, speed: float, size: float, seconds: float) -> Rollout:
+    """A body that starts 0.5 m before the end of the first support; lengths are `size` times as large."""
+    shapes = [shape for shape, _ in floor]
+    bodies = [
+        body(f"floor{k}", k, size * place, motion="static", friction=0.0, restitution=0.0, scale=size)
+        for k, (_, place) in enumerate(floor)
+    ]
+    start = size * np.array([-0.5, 0.01, 0.0])
+    moving = {"velocity": (speed * np.sqrt(size), 0, 0), "friction": 0.0, "restitution": 0.0, "scale": size}
+    bodies.append(body("it", len(shapes), start, 1.0, **moving))
+    scene = Scene((*shapes, it), tuple(bodies), np.array([0, 0, -9.81]), 10.0)
+    return Simulator(scene, "solver").run(seconds * np.sqrt(size))
+
+
+def one(box: tuple[tuple, tuple]) -> tuple[Shape, np.ndarray]:
+    """A box as a shape of its own, with the place of its centre."""
+    low, high = np.array(box)
+    return analytic_shape("box", size=tuple(high - low)), (low + high) / 2
+
+
+def one_body(boxes: list) -> list[tuple[Shape, np.ndarray]]:
+    return [(joined("floor", boxes, pieces=True), np.zeros(3))]
+
+
+def check_speed(rollout: Rollout, speed: float, size: float, within: float = 1e-3) -> None:
+    assert rollout.position[-1, -1, 0] > 0.2 * size  # it is across
+    assert rollout.velocity[:, -1] == pytest.approx(
+        np.tile([speed * np.sqrt(size), 0, 0], (len(rollout.time), 1)), abs=within * speed * np.sqrt(size)
+    )
+
+
+@pytest.mark.parametrize("order", ["AB", "BA", "CAB", "ACB", "BAC"])
+@pytest.mark.parametrize("gap", [0.0, 0.02])
+def test_the_order_of_pieces_does_not_matter(order, gap):
+    pieces = {"A": NEAR, "B": far(gap), "C": APART}
+    floor = one_body([pieces[name] for name in order])
+    check_speed(slid(floor, joined("it", BOX, pieces=True), 0.5, 1.0, 1.8), 0.5, 1.0)
+
+
+@pytest.mark.parametrize("boxes", [BOX, DESK], ids=["box", "table"])
+@pytest.mark.parametrize(("gap", "speed", "size"), [(1e-3, 0.5, 1.0), (0.01, 0.5, 1.0), (0.05, 0.5, 1.0),
+                                                    (0.02, 3.0, 1.0), (0.02, 0.1, 1.0), (0.02, 0.5, 0.05),
+                                                    (0.02, 0.5, 20.0)])  # fmt: skip
+def test_a_gap_between_two_supports_is_no_wall(boxes, gap, speed, size):
+    """The body is always supported: its centre is on the first support until its front is on the second."""
+    it = joined("it", boxes, pieces=True)
+    check_speed(slid([one(NEAR), one(far(gap))], it, speed, size, 0.9 / speed), speed, size)
+
+
+def test_slats_are_a_floor():
+    slats = [one(((x, -0.3, -0.05), (x + 0.08, 0.3, 0.0))) for x in np.arange(-1.0, 1.2, 0.12)]
+    for boxes in (BOX, DESK):
+        check_speed(slid(slats, joined("it", boxes, pieces=True), 1.0, 1.0, 1.2), 1.0, 1.0)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("boxes", [BOX, DESK], ids=["box", "table"])
+def test_a_step_up_is_a_wall(boxes, gap, together, speed=0.5):
+    pieces = [NEAR, far(gap, height=0.01)]
+    floor = one_body(pieces) if together else [one(piece) for piece in pieces]
+    rollout = slid(floor, joined("it", boxes, pieces=True), speed, 1.0, 2.0)
+    assert rollout.velocity[-1, -1, 0] == pytest.approx(0.0, abs=0.03)  # it is hit below its centre, and rocks
+    assert rollout.position[:, -1, 0].max() == pytest.approx(gap - 0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_who_falls_into_a_gap_meets_its_far_side(together, speed):
+    """A gap in which the body has room: its front sinks below the far edge, or it falls in, and what it then meets is a
+    wall. It never gets deep into one of the supports."""
+    deep = [((-1.0, -0.3, -1.0), (0.0, 0.3, 0.0)), ((0.7, -0.3, -1.0), (1.7, 0.3, 0.0))]
+    floor = one_body(deep) if together else [one(piece) for piece in deep]
+    it = joined("it", BOX, pieces=True)
+    rollout = slid(floor, it, speed, 1.0, 1.5)
+    points, worst = spread(BOX), 0.0
+    for place, turn in zip(rollout.position[:, -1], rollout.orientation[:, -1], strict=True):
+        worst = max(worst, deepest(deep, place + Rotation.from_quat(turn).apply(points - it.com)))
+    assert worst < 0.003
+    assert rollout.position[-1, -1, 2] < -0.1  # it did fall
+
+
+G = 9.81
+
+
+@pytest.fixture
+def tube(tmp_path):
+    """A tube of 96 facets whose walls are two and a half cells of its grid: its bore is 49.97 mm from the axis."""
+    file = tmp_path / "tube.obj"
+    import trimesh
+
+    trimesh.creation.annulus(0.05, 0.06, height=0.5, sections=96).export(file)
+    return file
+
+
+@pytest.mark.parametrize("sdf", ["mesh", "grid"])
+@pytest.mark.parametrize("radius", [0.0495, 0.049, 0.04])
+@pytest.mark.parametrize("scale", [0.1, 1.0, 100.0])
+def test_a_ball_falls_through_a_tube_that_it_fits(tube, sdf, radius, scale):
+    scene = SceneBuilder()
+    scene.add("tube", mesh=tube, sdf=sdf, scale=scale, motion="static", friction=0, restitution=0)
+    scene.add("ball", sphere={"radius": scale * radius}, position=(0, 0, 0.15 * scale), friction=0, restitution=0)
+    ran = Simulator(scene).run(seconds=0.2 * np.sqrt(scale))
+    fallen = 0.5 * G * ran.time[-1] ** 2
+    assert 0.15 * scale - ran.position[-1, 1, 2] == pytest.approx(fallen, rel=0.01)
+
+
+def test_nodes_between_others_lie_on_the_surface(tube):
+    """Within a twentieth of a cell, but for what is next to an edge, which the grid rounds off."""
+    scene = SceneBuilder()
+    scene.add("tube", mesh=tube, sdf="mesh", motion="static")
+    node = scene.load().shapes[0].contact.surface.node
+    radius = np.hypot(node[:, 0], node[:, 1])[np.abs(node[:, 2]) < 0.24]
+    away = np.minimum(np.abs(radius - 0.05), np.abs(radius - 0.06))
+    assert len(radius) > 500
+    assert away.max() < 2e-4

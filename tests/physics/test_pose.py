@@ -64,19 +64,6 @@ def test_rotation_vectors_round_trip_from_tiny_to_large(pose):
         np.testing.assert_allclose(pose.to_rotvec(-pose.from_rotvec(vector)), vector, rtol=1e-7, atol=1e-20)
 
 
-def test_leading_dimensions_are_batched_over(pose):
-    """One quaternion turns several vectors, and bodies are turned at several instants."""
-    v = np.random.default_rng(0).normal(size=(4, 5, 3))
-    quats = A.as_quat()[:20].reshape(4, 5, 4)
-    turned = A[:20].apply(v.reshape(-1, 3)).reshape(v.shape)
-    np.testing.assert_allclose(pose.rotate(quats, v), turned, atol=1e-13)
-    np.testing.assert_allclose(pose.to_matrix(quats), A[:20].as_matrix().reshape(4, 5, 3, 3), atol=1e-14)
-    one = np.broadcast_to(A.as_quat()[0], (4, 5, 4)).copy()
-    np.testing.assert_allclose(pose.rotate(one, v), A[0].apply(v.reshape(-1, 3)).reshape(v.shape), atol=1e-13)
-    for some in (quats[:0], quats[:, :0]):
-        assert pose.multiply(some, some).shape == pose.from_rotvec(some[..., :3]).shape == some.shape
-
-
 def test_a_quaternion_of_a_matrix():
     half_turns = Rotation.from_rotvec(np.pi * np.eye(3))
     for rotation in (A, half_turns, Rotation.identity(2)):

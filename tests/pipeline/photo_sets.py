@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageFilter
 
+from sdfsim.geometry.mesh import Mesh, joined
+from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import torus
 
 SAMPLES = Path(__file__).resolve().parents[2] / "samples" / "photos"
@@ -269,9 +271,6 @@ def shoot_labels(make: ModuleType, parts: list, poses: list[np.ndarray], count: 
 def shoot_bodies(folder: Path, build: Callable[[ModuleType], tuple[list, list[str]]], count: int = 48,
                  radius: float = 1.25) -> None:  # fmt: skip
     """A set with truth: `images`, `masks/NAME` of each body where a photo shows it, and `truth/NAME.ply`."""
-    from sdfsim.geometry.mesh import Mesh
-    from sdfsim.geometry.mesh_io import write_ply
-
     make = studio(640, 480, 620.0)
     parts, names = build(make)
     poses = around(count, radius)
@@ -361,9 +360,6 @@ def shoot_state(
 ) -> None:  # fmt: skip
     """Photos of `hinged` or `sliding` in one state, from all around, most of them from the front, at places of its
     own; and the true surface of what moves and of the rest, `truth/moves.ply` and `truth/still.ply`."""
-    from sdfsim.geometry.mesh import Mesh, joined
-    from sdfsim.geometry.mesh_io import write_ply
-
     make, rng = studio(640, 480, 620.0), np.random.default_rng(seed)
     parts, names = build(make, state)
     shoot(make, parts, state_poses(make, count, radius, rng), folder / "images")

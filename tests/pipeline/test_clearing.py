@@ -105,31 +105,33 @@ def test_gravity_says_which_way_is_up():
     check(replace(scene, gravity=np.array([0.0, 0.0, 9.81])), {"jar": (0, 0, -2)})
 
 
-def test_a_jar_beside_a_wall_is_moved_aside_and_not_over_it():
-    still = [("table", TABLE, (0, 0, 0)), ("wall", WALL, (0.3, 0, 0.52))]
-    check(scene_of(still, [("jar", JAR, (0.23 + MM, 0.05, ON_TABLE))]), {"jar": (-1, 0, 0)})
+BARE, WALLED = [("table", TABLE, (0, 0, 0))], [("table", TABLE, (0, 0, 0)), ("wall", WALL, (0.3, 0, 0.52))]
+STICKS = trimesh.creation.box((2.0, 0.01, 0.01)), trimesh.creation.box((0.01, 2.0, 0.01))
+LID = ("lid", trimesh.creation.box((0.06, 0.06, 0.02)), (0.1, 0, 0.02 + 0.12 + 0.01 - 4 * MM))
 
 
-def test_a_jar_in_a_wall_and_a_table_leaves_both():
-    still = [("table", TABLE, (0, 0, 0)), ("wall", WALL, (0.3, 0, 0.52))]
-    check(scene_of(still, [("jar", JAR, (0.23 + MM, 0.05, ON_TABLE - 2 * MM))]), {"jar": (-1, 0, 2)})
+@pytest.mark.parametrize(
+    ("still", "free", "wanted"),
+    [
+        (WALLED, [("jar", JAR, (0.23 + MM, 0.05, ON_TABLE))], {"jar": (-1, 0, 0)}),
+        (WALLED, [("jar", JAR, (0.23 + MM, 0.05, ON_TABLE - 2 * MM))], {"jar": (-1, 0, 2)}),
+        (BARE, [LID, ("jar", JAR, (0.1, 0, ON_TABLE - 3 * MM))], {"jar": (0, 0, 3), "lid": (0, 0, 4)}),
+        ([("lower", STICKS[0], (0, 0, 0))], [("upper", STICKS[1], (0.013, 0.017, 0.01 - MM))], {"upper": (0, 0, 1)}),
+    ],
+    ids=[
+        "aside, not over the wall",
+        "out of wall and table",
+        "the lid follows its jar",
+        "sticks without a corner inside",
+    ],
+)
+def test_bodies_go_out_by_the_shortest_way(still, free, wanted):
+    check(scene_of(still, free), wanted)
 
 
 def test_of_two_jars_in_each_other_one_goes_aside():
     jars = [("one", JAR, (0.0, 0.0, ON_TABLE)), ("other", JAR, (0.1 - MM, 0.0, ON_TABLE))]
-    check(scene_of([("table", TABLE, (0, 0, 0))], jars), {"other": (1, 0, 0)}, within=0.06 * MM)  # 64 sides
-
-
-def test_sticks_that_cross_leave_each_other_though_neither_has_a_corner_in_the_other():
-    lower, upper = trimesh.creation.box((2.0, 0.01, 0.01)), trimesh.creation.box((0.01, 2.0, 0.01))
-    place = (0.013, 0.017, 0.01 - MM)
-    check(scene_of([("lower", lower, (0, 0, 0))], [("upper", upper, place)]), {"upper": (0, 0, 1)})
-
-
-def test_what_stands_on_a_body_follows_it():
-    lid = trimesh.creation.box((0.06, 0.06, 0.02))
-    things = [("lid", lid, (0.1, 0, 0.02 + 0.12 + 0.01 - 4 * MM)), ("jar", JAR, (0.1, 0, ON_TABLE - 3 * MM))]
-    check(scene_of([("table", TABLE, (0, 0, 0))], things), {"jar": (0, 0, 3), "lid": (0, 0, 4)})
+    check(scene_of(BARE, jars), {"other": (1, 0, 0)}, within=0.06 * MM)  # 64 sides
 
 
 @pytest.mark.parametrize(("aside", "wanted"), [(0.0, 2.0), (12.0, 2.0)])
@@ -173,10 +175,9 @@ def test_the_mesh_of_a_shape_may_be_open_where_a_solid_is_given():
     """Of scenery the shape has what photos show: here the table's upper side alone."""
     scene = scene_of([("table", TABLE, (0, 0, 0))], [("jar", JAR, (0.1, 0.05, ON_TABLE - 3 * MM))])
     table = scene.shapes[0]
-    top = Mesh(table.mesh.vertices, table.mesh.faces[trimesh.Trimesh(*plain_of(table.mesh)).face_normals[:, 2] > 0.9])
+    top = Mesh(
+        table.mesh.vertices,
+        table.mesh.faces[trimesh.Trimesh(table.mesh.vertices, table.mesh.faces).face_normals[:, 2] > 0.9],
+    )
     opened = replace(scene, shapes=(replace(table, mesh=top), *scene.shapes[1:]))
     assert cleared(opened, {"table": table.mesh})["jar"].shift == pytest.approx([0, 0, 3 * MM], abs=0.02 * MM)
-
-
-def plain_of(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    return mesh.vertices, mesh.faces

@@ -1,4 +1,4 @@
-"""Reading photos: what is accepted, and one clear line for each thing that is not."""
+"""Reading photos: what is accepted, how sharp they are, and one clear line for each that is not."""
 
 import base64
 import io
@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from PIL import ExifTags, Image, ImageOps
+from PIL import ExifTags, Image, ImageFilter, ImageOps
 
-from pipeline.inputs.images import read_photo
+from pipeline.inputs.images import read_photo, sharpness
 from pipeline.inputs.photos import load_photos, prepare_photos
 from sdfsim.base.errors import EXIT_ERROR, SdfsimError
 from tests.helpers.photos import noise
+from tests.pipeline.photo_sets import TABLE_VASE
 
 
 def picture(width: int = 120, height: int = 80, seed: int = 0) -> Image.Image:
@@ -32,15 +33,17 @@ def encoded(kind: str, width: int, height: int) -> bytes:
     return data.getvalue()
 
 
-def absurd() -> bytes:
-    """A PNG of a few bytes that claims 100,000 px a side."""
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
-    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 2, 0, 0, 0)
-    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(b"\0")), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+def png(width: int, height: int, bits: int, color: int, rows: bytes, more: bytes = b"") -> bytes:
+    """A PNG that claims a size, with rows of so many bits a channel; `more` chunks lie behind its head."""
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color, 0, 0, 0)) + more
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+DRAWING = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 100 100\n(x) run showpage\n%%EOF\n"
 
 
 @pytest.mark.parametrize(
@@ -53,7 +56,11 @@ def absurd() -> bytes:
         (3, "cut.png", encoded("PNG", 400, 300)[:40_000], "cut.png: cannot be decoded"),
         (3, "cut.webp", encoded("WEBP", 400, 300)[:40_000], "cut.webp: cannot be decoded"),
         (3, "cut.avif", encoded("AVIF", 400, 300)[:20_000], "cut.avif: "),
-        (3, "bomb.png", absurd(), "bomb.png: too large (100000 x 100000"),
+        (3, "9.jpg", DRAWING, "9.jpg: not an image"),  # which a program would have to draw
+        # Claims that are refused before anything is decoded.
+        (3, "bomb.png", png(100_000, 100_000, 8, 2, b"\0"), "bomb.png: too large (100000 x 100000"),
+        (3, "bomb.png", png(2**31 - 1, 2**31 - 1, 8, 2, b"\0"), "bomb.png: "),
+        (3, "bomb.png", png(2**31 - 1, 64, 8, 2, b"\0"), "bomb.png: "),
         (3, "x.png", encoded("PNG", 20, 20), "x.png: too small"),
     ],
 )
@@ -158,17 +165,11 @@ RAMP = np.stack([np.tile(np.linspace(0, 1, 120), (80, 1)), np.tile(np.linspace(0
 EIGHT = (255 * RAMP + 0.5).astype(int)
 
 
-def png16(values: np.ndarray) -> bytes:
+def png16(values: np.ndarray, more: bytes = b"") -> bytes:
     """A PNG of 16 bits a channel, written by hand: grey, grey and alpha, RGB or RGBA [H, W, C]."""
-
-    def chunk(kind: bytes, body: bytes) -> bytes:
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
     height, width, channels = values.shape
-    header = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    parts = chunk(b"IHDR", header), chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")
-    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+    return png(width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], rows, more)
 
 
 def shown(path: Path) -> np.ndarray:
@@ -267,10 +268,7 @@ def test_deep_photos_are_turned_upright(tmp_path, orientation, kind):
     if kind == "png":
         exif = Image.Exif()
         exif[ExifTags.Base.Orientation] = orientation
-        body = exif.tobytes()[6:]
-        chunk = struct.pack(">I", len(body)) + b"eXIf" + body + struct.pack(">I", zlib.crc32(b"eXIf" + body))
-        data = png16(deep)
-        path.write_bytes(data[:33] + chunk + data[33:])
+        path.write_bytes(png16(deep, chunk(b"eXIf", exif.tobytes()[6:])))
     else:
         tifffile.imwrite(path, RAMP.astype(np.float32) if kind == "float" else deep, photometric="rgb",
                          extratags=[(274, 3, 1, orientation, True)])  # fmt: skip
@@ -430,3 +428,28 @@ def test_cmyk_palette_and_grey_show_what_they_show(tmp_path):
                                 ("grey.png", grey[..., None], 1)):  # fmt: skip
         assert np.abs(shown(tmp_path / name) - wanted).mean() < close, name
         assert read_photo(tmp_path / name, 120).mask is None
+
+
+@pytest.fixture(scope="module")
+def photo() -> Image.Image:
+    return Image.open(TABLE_VASE / "images" / "000.jpg").convert("RGB")
+
+
+def test_a_blur_shows_whatever_the_contrast_and_the_noise(photo):
+    rng = np.random.default_rng(0)
+    for contrast in (1.0, 0.3):
+        pixels = 128 + contrast * (np.asarray(photo, float) - 128) + rng.normal(0, 2, (*photo.size[::-1], 3))
+        sharp = Image.fromarray(pixels.clip(0, 255).astype(np.uint8))
+        blurred = sharp.filter(ImageFilter.GaussianBlur(2))
+        assert sharpness(np.asarray(sharp)) > 0.3
+        assert sharpness(np.asarray(blurred)) < 0.1
+
+
+def test_an_object_in_focus_before_a_soft_background_is_sharp(photo):
+    soft = photo.filter(ImageFilter.GaussianBlur(5))
+    soft.paste(photo.crop((240, 120, 420, 320)), (240, 120))
+    assert sharpness(np.asarray(soft)) > 0.3
+
+
+def test_a_plain_photo_has_no_sharpness():
+    assert sharpness(np.full((80, 80, 3), 90, np.uint8)) == 0.0

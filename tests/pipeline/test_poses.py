@@ -1,4 +1,5 @@
-"""The ladder of attempts, the child process, and what a killed run leaves."""
+"""Poses: the ladder of attempts, the child process, what a killed run leaves, and photos with one thing wrong each,
+which is named."""
 
 import json
 import shutil
@@ -8,16 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from pipeline.cameras import view_span
-from pipeline.inputs.photos import prepare_photos
+from pipeline.cameras import load_poses, load_views, save_views
+from pipeline.inputs.photos import KNOWN_CAMERAS, load_photos, prepare_photos
 from pipeline.sfm import poses, worker
-from pipeline.sfm.agreement import agreement, contradicting, epipolar_errors, excess, excess_of_photos, unexplained
-from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find, views_of
+from pipeline.sfm.agreement import agreement, excess, excess_of_photos, unexplained
+from pipeline.sfm.pose_checks import check, failure_hint, failure_message, find
 from pipeline.sfm.poses import ORDINARY, run_worker, size_groups, solve
+from pipeline.sfm.worker import zooms_of
 from sdfsim.base.errors import EXIT_QUALITY, SdfsimError
 from sdfsim.base.files import write_arrays, write_json
 from tests.helpers.photos import photo, result, turned
+from tests.pipeline import photo_sets
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 TABLE_VASE = ROOT / "samples" / "photos" / "table_vase"
@@ -179,11 +183,6 @@ def test_cameras_on_one_side_are_no_closed_object():
     assert verdict["failures"] == [] and "from one side (81 degrees" in verdict["warnings"][0]
 
 
-@pytest.mark.parametrize(("span", "expected"), [(90.0, 81.0), (200.0, 180.0), (360.0, 324.0)])
-def test_span_is_the_arc_less_the_largest_gap(span, expected):
-    assert view_span(views_of(result(10, 10, span=span), PHOTOS), np.zeros(3)) == pytest.approx(expected, abs=0.01)
-
-
 def test_components_need_more_than_a_few_matches():
     found = result(6, 0, matches=200)
     found["pairs"][2]["matches"] = 20
@@ -224,8 +223,6 @@ def test_a_child_that_hangs_is_ended(tmp_path, monkeypatch):
 
 
 def test_photos_without_anything_in_common_fail_with_reasons(tmp_path):
-    from PIL import Image
-
     folder = tmp_path / "in"
     folder.mkdir()
     for k in range(3):
@@ -325,31 +322,6 @@ def test_a_finished_attempt_is_not_run_again(tmp_path, monkeypatch):
     assert run_worker(job, tmp_path / "try", 1.0, lambda fraction, message: None) == {"views": []}
 
 
-@pytest.mark.parametrize(
-    ("pairs", "left"), [(None, []), ([["c.jpg", "a.jpg"], ["b.jpg", "c.jpg"]], [("a.jpg", "b.jpg")])]
-)
-def test_features_of_an_attempt_are_matched_again_where_they_should(tmp_path, pairs, left):
-    import pycolmap
-
-    names = ["a.jpg", "b.jpg", "c.jpg"]
-    with pycolmap.Database.open(tmp_path / "first.db") as opened:
-        camera = pycolmap.Camera(model="SIMPLE_PINHOLE", width=9, height=9, params=[9.0, 4.5, 4.5])
-        camera.camera_id = opened.write_camera(camera)
-        number = {name: opened.write_image(pycolmap.Image(name=name, camera_id=camera.camera_id)) for name in names}
-        for k, a in enumerate(names):
-            opened.write_keypoints(number[a], np.full((5, 2), k, np.float32))
-            for b in names[k + 1 :]:
-                matched = np.tile(np.arange(5, dtype=np.uint32)[:, None], 2)
-                opened.write_matches(number[a], number[b], matched)
-                opened.write_two_view_geometry(number[a], number[b], pycolmap.TwoViewGeometry(inlier_matches=matched))
-    job = {"features_of": str(tmp_path / "first.db"), "pairs": pairs}
-    worker.take_features(job, tmp_path / "database.db")
-    counts, verified = worker.read_pairs(pycolmap, tmp_path / "database.db")
-    assert counts == dict.fromkeys(names, 5) and [pair[:2] for pair in verified] == left
-    with pycolmap.Database.open(tmp_path / "database.db") as opened:
-        assert len(opened.read_all_matches()[0]) == len(left)
-
-
 def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     write_json(tmp_path / "job.json", {"count": 4})
     (tmp_path / "database.db").write_text("old")
@@ -358,20 +330,6 @@ def test_the_leavings_of_another_job_go(tmp_path, monkeypatch):
     with pytest.raises(SdfsimError):
         run_worker(job, tmp_path, 5.0, lambda fraction, message: None)
     assert not (tmp_path / "database.db").exists()
-
-
-def test_epipolar_errors_are_those_of_projected_points():
-    """Of two zooms: matches of points that both cameras see have no error. One that lies 3 px off its line in the photo
-    of twice the focal length is as near to a point as 3 / sqrt(5) px."""
-    views = result(10, 10)["views"]
-    views[0]["k"] = views[1]["k"] = 0.05
-    views[1]["focal"] *= 2
-    a, b = poses.views_of({"views": views[:2]}, [photo(0), photo(1)])
-    points = np.random.default_rng(0).normal(size=(200, 3)) * 0.5
-    first, second = a.project(points)[0], b.project(points)[0]
-    assert epipolar_errors(a, b, first, second).max() < 1e-3
-    moved = second + np.array([0, 3.0])  # The cameras turn about y, so all lines are nearly level.
-    assert np.median(epipolar_errors(a, b, first, moved)) == pytest.approx(3 / 5**0.5, rel=0.2)
 
 
 def pictured(views: list[dict], noise: float = 0.3) -> list:
@@ -397,45 +355,15 @@ def test_a_wrong_focal_length_shows_in_how_far_the_matches_lie(times, right):
     assert all((times < 1.5) == right for times in excess_of_photos(entries).values())
 
 
-def test_photos_without_a_pose_are_left_unexplained():
-    views = result(8, 8, span=160.0)["views"]
-    pairs = pictured(views)
-    all_of, seven = agreement(pairs, views), agreement(pairs, views[:7])
-    assert unexplained(seven) == pytest.approx(unexplained(all_of) * 21 / 28 + 7 / 28, abs=0.01)
-    assert contradicting(seven) == 0 and views[7]["name"] not in excess_of_photos(seven)
-
-
 def test_zooms_are_reported_apart_by_the_focal_lengths_of_each_photo_alone():
-    from pipeline.sfm.worker import zooms_of
-
     focals = {"a": 700.0, "b": 1030.0, "c": 680.0, "d": 1060.0, "e": 735.0}
     assert zooms_of([*"abcdef"], focals) == [["c", "a", "e"], ["b", "d"], ["f"]]
     assert zooms_of([*"ace"], focals) == [["c", "a", "e"]] and zooms_of(["f"], focals) == [["f"]]
 
 
-def test_turning_on_the_spot_is_reported_from_walking():
-    from pipeline.sfm.worker import turn_only
-
-    rng = np.random.default_rng(0)
-    size = {"width": 640, "height": 480}
-    directions = rng.uniform([-0.4, -0.3, 1], [0.4, 0.3, 1], (300, 3))
-    turn = np.array([[np.cos(0.2), 0, np.sin(0.2)], [0, 1, 0], [-np.sin(0.2), 0, np.cos(0.2)]])
-
-    def seen(points: np.ndarray) -> np.ndarray:
-        return 600 * points[:, :2] / points[:, 2:] + [320, 240]
-
-    turned = (size, seen(directions), seen(directions @ turn.T) + rng.normal(0, 0.5, (300, 2)))
-    deep = directions * rng.uniform(1, 4, (300, 1))
-    walked = (size, seen(deep), seen(deep + np.array([0.4, 0, 0])))
-    assert turn_only([turned, turned, walked]) == pytest.approx(2 / 3)
-    assert turn_only([walked]) == 0.0
-
-
 def zoomed(folder: Path, count: int, zooms: dict[int, float]) -> tuple[dict[str, float], dict[str, np.ndarray]]:
     """Writes `count` photos of the bundled set, without EXIF, of which every so manyth is cropped to its middle and
     enlarged again; returns the true focal lengths and camera centres by file name."""
-    from PIL import Image
-
     about = json.loads((TABLE_VASE / "transforms.json").read_text())
     folder.mkdir()
     focals, centers = {}, {}
@@ -456,8 +384,6 @@ def zoomed(folder: Path, count: int, zooms: dict[int, float]) -> tuple[dict[str,
 def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
     from pycolmap import estimate_sim3d
 
-    from pipeline.cameras import load_views
-
     focals, centers = zoomed(tmp_path / "in", 20, zooms)
     photos, _ = prepare_photos(tmp_path / "in", tmp_path, long_side=640)
     checks = solve(photos, tmp_path, tmp_path)
@@ -469,39 +395,6 @@ def test_twenty_photos_of_one_or_two_zooms_are_posed_right(tmp_path, zooms):
     assert move
     off = np.linalg.norm(move.scale * found @ move.rotation.matrix().T + move.translation - true, axis=1)
     assert off.max() < 0.01 * np.linalg.norm(true - true.mean(0), axis=1).mean()
-
-
-def write_features(database: Path, groups: list[int], shared: int) -> None:
-    """A database of photos that belong to groups: of each photo's 60 features as many are `shared` by its group."""
-    import pycolmap
-
-    rng = np.random.default_rng(0)
-    common = {group: rng.integers(0, 256, (shared, 128)) for group in set(groups)}
-    with pycolmap.Database.open(database) as opened:
-        camera = opened.write_camera(
-            pycolmap.Camera(model="SIMPLE_RADIAL", width=64, height=64, params=[60, 32, 32, 0])
-        )
-        for number, group in enumerate(groups):
-            image = opened.write_image(pycolmap.Image(name=f"{number}.jpg", camera_id=camera))
-            found = np.concatenate([common[group], rng.integers(0, 256, (60 - shared, 128))])
-            noise = rng.integers(-4, 5, found.shape)
-            places = np.column_stack([rng.random((60, 2)), np.full(60, 2.0), np.zeros((60, 2)), np.full(60, 2.0)])
-            opened.write_keypoints(image, places.astype(np.float32))
-            data = np.clip(found + noise, 0, 255).astype(np.uint8)
-            kind = pycolmap.FeatureExtractorType.SIFT
-            opened.write_descriptors(image, pycolmap.FeatureDescriptors(type=kind, data=data))
-
-
-def test_photos_are_paired_with_those_that_have_most_in_common(tmp_path):
-    import pycolmap
-
-    write_features(tmp_path / "database.db", [0, 1, 0, 1, 0, 1, 2], 30)
-    pairs = worker.alike(pycolmap, {"partners": 3}, tmp_path / "database.db")
-    assert sorted(pairs) == [
-        ("0.jpg", "2.jpg"), ("0.jpg", "4.jpg"), ("1.jpg", "3.jpg"), ("1.jpg", "5.jpg"), ("2.jpg", "4.jpg"),
-        ("3.jpg", "5.jpg"),
-    ]  # fmt: skip
-    assert len(worker.alike(pycolmap, {"partners": 1}, tmp_path / "database.db")) < 6
 
 
 @pytest.mark.parametrize(("still", "found"), [(12, [0.0625, 0.0833, 0.2083, 0.1667]), (0, []), (400, [])])
@@ -591,17 +484,10 @@ def test_a_lens_of_another_kind_is_refused_and_named(monkeypatch, tmp_path):
         assert check({**result(10, 10), "lens": usual}, PHOTOS)["failures"] == []
 
 
-def test_cameras_too_close_together_fail():
-    verdict = check(result(10, 10, span=1.0), PHOTOS)
-    assert "too close together" in verdict["failures"][0]
-
-
 @pytest.mark.slow
 def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch):
     """Their names tell nothing: a quarter of the pairs is matched, and all are posed, the loop around the table
     closed."""
-    from pipeline.cameras import load_views
-
     shuffled = np.random.default_rng(4).permutation(48)
     (tmp_path / "in").mkdir()
     for number, path in zip(shuffled, sorted((TABLE_VASE / "images").iterdir()), strict=True):
@@ -615,15 +501,147 @@ def test_photos_in_no_order_are_matched_by_what_they_show(tmp_path, monkeypatch)
     assert [view.focal for view in load_views(tmp_path)] == pytest.approx([620.0] * 48, rel=0.005)
 
 
-@pytest.mark.slow
-def test_poses_of_the_rendered_set(tmp_path):
-    sys.path.insert(0, str(ROOT))
-    from benchmarks.reconstruct import pose_errors
-    from pipeline.cameras import load_views
+pytestmark = pytest.mark.slow
 
-    photos, _ = prepare_photos(TABLE_VASE, tmp_path, long_side=640)
-    solve(photos, tmp_path, tmp_path)
-    report, _ = pose_errors(load_views(tmp_path), TABLE_VASE)
-    assert report["posed"] == 48
-    assert report["center_error_worst_percent"] < 0.5
-    assert report["focal_error_percent"] < 0.5
+
+def posed(folder: Path, work: Path) -> dict:
+    photos, _ = prepare_photos(folder, work)
+    return solve(photos, work, work)
+
+
+def failure(folder: Path, work: Path) -> str:
+    with pytest.raises(SdfsimError) as caught:
+        posed(folder, work)
+    assert caught.value.exit_code == EXIT_QUALITY and "\n" not in caught.value.message
+    return caught.value.message
+
+
+def test_three_photos_of_different_sides(tmp_path):
+    (tmp_path / "in").mkdir()
+    for number in (15, 19, 23):
+        shutil.copy(photo_sets.TABLE_VASE / "images" / f"{number:03d}.jpg", tmp_path / "in")
+    assert "3 photos are too few" in failure(tmp_path / "in", tmp_path)
+
+
+def test_a_blank_wall(tmp_path):
+    photo_sets.blank_wall(tmp_path / "in")
+    message = failure(tmp_path / "in", tmp_path)
+    assert "only 0 of 30 photos" in message and "there is too little to see" in message and "blank wall" in message
+
+
+def test_two_sets_in_one_folder(tmp_path):
+    photo_sets.two_sets(tmp_path / "in")
+    verdict = posed(tmp_path / "in", tmp_path)
+    assert verdict["posed"] >= 16
+    left = {entry["photo"]: entry["why"] for entry in verdict["left_out"]}
+    assert sum(name.startswith("other_") for name in left) == 10
+    assert sum("shows something else" in why for name, why in left.items() if name.startswith("other_")) >= 8
+    assert any("nothing in common" in cause for cause in verdict["causes"])
+
+
+def test_all_photos_from_one_spot(tmp_path):
+    photo_sets.one_spot(tmp_path / "in")
+    message = failure(tmp_path / "in", tmp_path)
+    assert "taken from one spot" in message and "step sideways" in message
+
+
+def test_every_second_photo_blurred(tmp_path):
+    photo_sets.half_blurred(tmp_path / "in")
+    photos, notes = prepare_photos(tmp_path / "in", tmp_path)
+    assert [p.fault for p in photos] == ["", "blurred"] * 24
+    assert any(note.startswith("24 of 48 photos are blurred, take them again: 001.jpg, 003.jpg") for note in notes)
+    verdict = solve(photos, tmp_path, tmp_path)
+    assert verdict["posed"] >= 24
+    assert all(entry["kind"] in ("fault", "features") for entry in verdict["left_out"])
+
+
+def test_a_repeating_texture(tmp_path):
+    """Either nothing that can be trusted comes out, and why; or the poses are right, the focal length with them."""
+    photo_sets.repeating(tmp_path / "in")
+    try:
+        posed(tmp_path / "in", tmp_path)
+    except SdfsimError as error:
+        assert "repeats" in error.message
+        return
+    focal = np.median([view.focal for view in load_views(tmp_path)])
+    assert focal == pytest.approx(465.0, rel=0.1)
+
+
+def test_a_turntable_before_a_background_that_stands_still(tmp_path):
+    photo_sets.turntable(tmp_path / "in")
+    try:
+        verdict = posed(tmp_path / "in", tmp_path)
+        assert "turntable" in verdict["causes"][0]
+    except SdfsimError as error:
+        assert "turntable" in error.message and "masks" in error.message
+
+
+def test_the_same_photos_give_the_same_poses(tmp_path):
+    photo_sets.good(tmp_path / "in", 12)
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        posed(tmp_path / "in", tmp_path / name)
+    for one, two in zip(load_views(tmp_path / "one"), load_views(tmp_path / "two"), strict=True):
+        assert one.focal == two.focal and one.name == two.name
+        assert np.array_equal(one.rotation, two.rotation) and np.array_equal(one.translation, two.translation)
+    assert np.array_equal(load_poses(tmp_path / "one").sparse.xyz, load_poses(tmp_path / "two").sparse.xyz)
+
+
+def test_known_cameras_are_kept_and_checked(tmp_path):
+    """The true cameras get sparse points on the true surface; cameras of other photos are found out."""
+    photo_sets.good(tmp_path / "in", 12)
+    work = tmp_path / "work"
+    work.mkdir()
+    photos, _ = prepare_photos(tmp_path / "in" / "transforms.json", work)
+    verdict = solve(photos, work, work)
+    assert verdict["known_cameras"] and verdict["posed"] == 12 and verdict["mean_error"] < 1.0
+    points = load_poses(work).sparse.xyz
+    inside = np.abs(points).max(1) < 2.4
+    top = np.abs(points[:, 2] - 0.35) < 0.01
+    floor = np.abs(points[:, 2]) < 0.01
+    sides = (np.abs(np.abs(points[:, 0]) - 0.3) < 0.01) | (np.abs(np.abs(points[:, 1]) - 0.2) < 0.01)
+    assert (top | floor | sides)[inside].mean() > 0.9
+
+    wrong = tmp_path / "wrong"
+    wrong.mkdir()
+    views = load_views(work)
+    (wrong / "images").symlink_to(work / "images")
+    moved = [type(v)(**{**v.__dict__, "name": o.name}) for v, o in zip(views, views[3:] + views[:3], strict=True)]
+    save_views(moved, wrong / KNOWN_CAMERAS)
+    with pytest.raises(SdfsimError, match="known cameras"):
+        solve(load_photos(work), wrong, wrong)
+
+
+def test_a_killed_run_goes_on_and_ends_as_an_undisturbed_one(tmp_path):
+    """Killed once features are there, and again while it matches."""
+    import os
+    import signal
+    import subprocess
+    import time
+
+    photo_sets.good(tmp_path / "in", 10)
+    code = (
+        "import sys; from pathlib import Path\nfrom pipeline.inputs.photos import load_photos\n"
+        "from pipeline.sfm.poses import solve\nwork = Path(sys.argv[1]); solve(load_photos(work), work, work)"
+    )
+    work = tmp_path / "work"
+    work.mkdir()
+    prepare_photos(tmp_path / "in", work)
+    whole = tmp_path / "whole"
+    shutil.copytree(work, whole)
+    solve(load_photos(whole), whole, whole)
+    log = work / "try_ordinary" / "progress.log"
+    for word in ("phase matches", "phase mapping"):
+        child = subprocess.Popen([sys.executable, "-c", code, str(work)])
+        while child.poll() is None and not (log.exists() and word in log.read_text()):
+            time.sleep(0.02)
+        if child.poll() is None:
+            os.kill(child.pid, signal.SIGKILL)
+        child.wait()
+        time.sleep(2.5)  # COLMAP's process notices within a second that its parent is gone.
+    solve(load_photos(work), work, work)
+    one, two = (json.loads((folder / "cameras.json").read_text())["views"] for folder in (work, whole))
+    assert [view["name"] for view in one] == [view["name"] for view in two]
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_allclose(a["rotation"], b["rotation"], atol=1e-6)
+        assert a["focal"] == pytest.approx(b["focal"], rel=1e-5)

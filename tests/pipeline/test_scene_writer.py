@@ -144,12 +144,6 @@ def test_a_scene_file_changed_by_hand_is_kept(fitted):
         assert yaml.safe_load(scene.read_text())["version"] == 1
 
 
-def test_bodies_stand_where_they_were_found(fitted):
-    write_scene(fitted, fitted / "scene.yaml", drop="none")
-    body = yaml.safe_load((fitted / "scene.yaml").read_text())["bodies"][-1]
-    np.testing.assert_allclose(body["position"], [-0.6, 0.5, 0.0], atol=1e-4)
-
-
 @pytest.mark.parametrize(("deep", "told"), [(0.0015, "moved up by 0.0015 m, out of scenery"),
                                             (0.04, "more than the 0.03 m that photos cannot resolve")])  # fmt: skip
 def test_a_body_that_photos_put_into_the_floor_starts_on_it(fitted, deep, told):

@@ -59,7 +59,6 @@ def seen(tmp_path_factory):
 
 def test_what_is_shown_lies_on_the_room(seen):
     around = seen[0]
-    assert around is not None
     off = np.abs(room(around.shown.vertices))
     assert np.quantile(off, 0.5) < 0.3 * around.cell and np.quantile(off, 0.95) < 1.5 * around.cell
     level = around.shown.vertices[np.abs(around.shown.vertices[:, 2] - FLOOR) < 0.3 * around.cell]

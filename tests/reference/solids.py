@@ -12,7 +12,21 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 RIM = 32  # directions of a rim, over half a turn
+HALF = np.pi * np.arange(RIM) / RIM
+RING = 2.0 * np.pi * np.arange(16) / 16  # directions around a normal
 KINDS = ("sphere", "capsule", "box", "cylinder", "hull")
+
+
+def across(axis: np.ndarray) -> np.ndarray:
+    """[2, 3] unit vectors across an axis and each other."""
+    u = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.6 else [0.0, 1.0, 0.0])
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(axis, u)])
+
+
+def circle(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """[K, 3] unit vectors across an axis, at angles [K]."""
+    return np.stack([np.cos(angle), np.sin(angle)], 1) @ across(axis)
 
 
 @dataclass(frozen=True)
@@ -79,10 +93,7 @@ class Solid:
             return None
         if self.disc:
             middle = self.core[0 if self.kind == "cone" else int((self.core @ along).argmax())]
-            u = np.cross(along, [1.0, 0.0, 0.0] if abs(along[0]) < 0.6 else [0.0, 1.0, 0.0])
-            u /= np.linalg.norm(u)
-            angle = np.linspace(0.0, 2.0 * np.pi, 256, endpoint=False)[:, None]
-            return middle + self.disc * (np.cos(angle) * u + np.sin(angle) * np.cross(along, u))
+            return middle + self.disc * circle(along, np.linspace(0.0, 2.0 * np.pi, 256, endpoint=False))
         return self.core[np.abs(self.core @ self.planes[best, :3] + self.planes[best, 3]) < 1e-8 * self.extent]
 
 
@@ -110,8 +121,7 @@ def placed(kind: str, sizes: np.ndarray, turn: np.ndarray, place: np.ndarray, sc
         edges, normals, offsets = np.concatenate([rim[:RIM], sides]), np.array([[0, 0, -1.0]]), np.array([-sizes[1]])
     elif kind == "cylinder":
         core, disc, thickness = np.outer([-sizes[1], sizes[1]], [0, 0, 1.0]), sizes[0], 2.0 * sizes.min()
-        angle = np.pi * np.arange(RIM) / RIM
-        rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(RIM)], 1)
+        rim = np.stack([np.cos(HALF), np.sin(HALF), np.zeros(RIM)], 1)
         edges, normals = np.concatenate([[[0, 0, 1.0]], rim]), np.array([[0, 0, 1.0], [0, 0, -1.0]])
         offsets = np.array([-sizes[1], -sizes[1]])
     else:
@@ -140,9 +150,9 @@ def width(a: Solid, b: Solid, n: np.ndarray) -> np.ndarray:
 def views(a: Solid, b: Solid) -> tuple[np.ndarray, np.ndarray]:
     """[K, 3] normals, among them those of least depth of flat faces and straight edges, and what each shows [K]."""
     n = [a.planes[:, :3], b.planes[:, :3], np.cross(a.edges[:, None], b.edges[None]).reshape(-1, 3)]
-    n += [_around(solid.axis) for solid in (a, b) if solid.kind in ("capsule", "cylinder", "cone")]
+    n += [circle(solid.axis, HALF) for solid in (a, b) if solid.kind in ("capsule", "cylinder", "cone")]
     for solid in (solid for solid in (a, b) if solid.kind == "cone"):
-        tall, out = np.linalg.norm(solid.core[1] - solid.core[0]), _around(solid.axis)
+        tall, out = np.linalg.norm(solid.core[1] - solid.core[0]), circle(solid.axis, HALF)
         n += [tall * way + solid.disc * solid.axis for way in (out, -out)]
     n += [[a.core.mean(0) - b.core.mean(0)], [[0.0, 0.0, 1.0]]]
     n = np.concatenate(n)
@@ -168,19 +178,11 @@ def least_depth(a: Solid, b: Solid) -> tuple[float, np.ndarray]:
     return max(tried, key=lambda one: one[0])
 
 
-def _around(axis: np.ndarray) -> np.ndarray:
-    """[K, 3] directions across an axis."""
-    u = np.cross(axis, [1.0, 0.0, 0.0] if abs(axis[0]) < 0.6 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    angle = np.pi * np.arange(RIM)[:, None] / RIM
-    return np.cos(angle) * u + np.sin(angle) * np.cross(axis, u)
-
-
 def _climbed(a: Solid, b: Solid, n: np.ndarray) -> tuple[float, np.ndarray]:
     """The widest view near a normal: a search in narrowing circles."""
     best, step = float(width(a, b, n[None])[0]), 0.1
     for _ in range(120):
-        ring = step * _ring(n)
+        ring = step * circle(n, RING)
         tried = n + np.concatenate([ring, 0.5 * ring])
         tried /= np.linalg.norm(tried, axis=1, keepdims=True)
         found = width(a, b, tried)
@@ -192,16 +194,9 @@ def _climbed(a: Solid, b: Solid, n: np.ndarray) -> tuple[float, np.ndarray]:
     return best, n
 
 
-def _ring(n: np.ndarray) -> np.ndarray:
-    u = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.6 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    angle = 2.0 * np.pi * np.arange(16)[:, None] / 16
-    return np.cos(angle) * u + np.sin(angle) * np.cross(n, u)
-
-
 def is_sharp(a: Solid, b: Solid, n: np.ndarray) -> bool:
     """Whether every little tilt of a face's normal shows less of the gap in proportion: it is then the only one."""
-    tilted = n + 1e-4 * _ring(n)
+    tilted = n + 1e-4 * circle(n, RING)
     tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
     lost = width(a, b, n[None])[0] - width(a, b, tilted)
     return bool((lost > 1e-6 * min(a.thickness, b.thickness)).all())
@@ -209,9 +204,7 @@ def is_sharp(a: Solid, b: Solid, n: np.ndarray) -> bool:
 
 def overlap(first: np.ndarray, second: np.ndarray, n: np.ndarray) -> float:
     """m^2, the area that two convex polygons [K, 3] have in common as seen along n."""
-    u = np.cross(n, [1.0, 0.0, 0.0] if abs(n[0]) < 0.6 else [0.0, 1.0, 0.0])
-    u /= np.linalg.norm(u)
-    frame = np.stack([u, np.cross(n, u)], 1)
+    frame = across(n).T
     kept, bounds = ring_of(first @ frame), ring_of(second @ frame)
     for p, q in zip(bounds, np.roll(bounds, -1, axis=0), strict=True):
         if not len(kept):

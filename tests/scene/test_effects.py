@@ -111,19 +111,6 @@ LISTS = {
 }
 
 
-def test_random_lists_are_kept():
-    rng = np.random.default_rng(1)
-    for _ in range(60):
-        size = int(rng.integers(1, 9))
-        lists = [[f"b{j}" for j in np.flatnonzero(rng.random(size) < rng.random())] for _ in range(size)]
-        bodies = many(size, lambda k, lists=lists: None if rng.random() < 0.3 else ["floor", *lists[k]])
-        group, allowed = contact_groups(bodies)
-        for i, x in enumerate(bodies):
-            for j, y in enumerate(bodies[i + 1 :], i + 1):
-                moves = "dynamic" in (x.motion, y.motion)
-                assert (moves and bool(allowed[group[i], group[j]])) == may_touch(x, y)
-
-
 @pytest.mark.parametrize(
     ("name", "groups"),
     [

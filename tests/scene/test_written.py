@@ -39,12 +39,6 @@ def test_a_scene_written_in_python_is_that_of_its_file(tmp_path):
     assert "../" in file.read_text()  # the path of the ring starts at the folder of the file
 
 
-def test_a_simulator_takes_it():
-    rollout = sdfsim.Simulator(written()).run()
-    fall = 0.3 - 0.5 * 9.81 * rollout.time[-1] ** 2
-    assert rollout.position[-1, 1, 2] == pytest.approx(fall, abs=1e-9)
-
-
 def test_unknown_keys_are_reported_at_once():
     with pytest.raises(SceneError, match=r"body 'a': unknown key 'sphre' \(did you mean 'sphere'\?\)"):
         sdfsim.Scene().add("a", sphre={"radius": 1})

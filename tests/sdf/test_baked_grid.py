@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
@@ -18,7 +17,6 @@ from sdfsim.scene.scene import Scene
 from sdfsim.sdf import baked_grid as module
 from sdfsim.sdf.baked_grid import BakedGrid, bake, baked, unseen_wall, wall_thickness
 from sdfsim.sdf.mesh_sdf import MeshSdf
-from sdfsim.sdf.reference import PiecesDistance
 from sdfsim.shape import contact_geometry
 from sdfsim.shape.contact_geometry import MOST_PATCHES, ContactGeometry, patches_of
 from sdfsim.shape.make import analytic_shape
@@ -103,12 +101,6 @@ def test_a_solid_that_comes_to_edges_has_no_thin_walls(name):
     assert unseen_wall(sdf, finest(sdf, nodes)) is None
 
 
-def test_edges_are_thin():
-    mesh = convex_hull(np.array(CONVEX["wedge"], float))
-    grid = finest(MeshSdf(mesh), np.concatenate([mesh.vertices, edge_nodes(mesh.vertices, 0.05)]))
-    assert grid.thickness <= 2.001 * grid.cell  # what made walls of them
-
-
 @pytest.mark.parametrize("wall", [0.001, 0.003])
 def test_a_hollow_solid_with_thin_walls_is_reported_of(wall):
     outer = analytic_shape("box", size=(1.0, 0.8, 0.6)).mesh
@@ -119,35 +111,12 @@ def test_a_hollow_solid_with_thin_walls_is_reported_of(wall):
     assert found is not None and found <= 0.004
 
 
-def test_where_pieces_are_known_the_grid_is_of_these():
-    pieces = two_halves()
-    bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
-    grid = bake(bar.sdf, bar.nodes, pieces)
-    above = np.array([[-0.5, 0.0, 0.21], [0.5, 0.0, 0.11], [0.5, 0.0, 0.15]])
-    np.testing.assert_allclose(module.interpolated(grid, above), [0.01, 0.01, 0.05], atol=2 * grid.error)
-
-
 def test_what_is_known_of_a_shape_with_pieces_is_not_taken_for_one_without():
     bar, pieces = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh"), tuple(two_halves())
     above = np.array([[0.5, 0.0, 0.15]])
     for known, want in ((pieces, 0.05), ((), -0.05), (pieces, 0.05)):
         grid = replace(bar, pieces=known).contact.grid
-        assert grid is not None
         np.testing.assert_allclose(module.interpolated(grid, above), [want], atol=2 * grid.error)
-
-
-def test_the_surface_of_pieces_has_a_patch_for_each():
-    pieces = two_halves()
-    bar = with_sdf(analytic_shape("box", size=(2.0, 0.4, 0.4)), "mesh")
-    nodes = np.array([[-0.9, 0.0, 0.25], [0.4, 0.02, 0.08]])  # beside the surface, as those of a fitted SDF are
-    surface = patches_of(bar.sdf, nodes, pieces)
-    vertices = surface["node"][:-2]
-    assert {tuple(v) for v in vertices.round(9)} == {tuple(v) for v in np.concatenate(pieces).round(9)}
-    np.testing.assert_allclose(surface["node"][-2:], [[-0.9, 0.0, 0.2], [0.4, 0.02, 0.1]], atol=1e-6)
-    np.testing.assert_array_equal(surface["patch"], [0] * 8 + [1] * 8 + [0, 1])
-    places = np.array([[-0.8, 0.0, 0.2], [0.8, 0.0, 0.2]])
-    at = np.round((places - surface["label_low"]) / surface["label_cell"]).astype(int)
-    assert [int(surface["label"][tuple(k)]) for k in at] == [0, 1]
 
 
 def test_the_balls_of_leaves_hold_the_whole_surface(block):
@@ -213,35 +182,6 @@ def test_a_full_disk_costs_only_the_cache(block, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(module, "CELLS", 16)
     monkeypatch.setattr(module, "FINEST", 16)
     assert baked(block.sdf, block.nodes, cache_dir=tmp_path / "file" / "baked").cell == grid.cell
-
-
-@pytest.mark.parametrize("size", [1e-6, 1e-3, 1.0, 1e4])
-def test_convex_pieces_are_the_same_at_every_size(size):
-    """Distances and patches of an L of two pieces, one of them turned, in micrometres as in kilometres."""
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-0.3, 0.3) for z in (-0.2, 0.2)])
-    turn = Rotation.from_euler("xyz", [20, 35, 50], degrees=True)
-    pieces = [corners, turn.apply(corners) + np.array([1.0, 0.6, 0.3])]
-    points = np.random.default_rng(0).uniform(-2.0, 2.5, (3000, 3))
-
-    def measured(factor: float):
-        hulls = [convex_hull(piece * factor) for piece in pieces]
-        union = PiecesDistance(hulls)
-        mesh = MeshSdf(union.surface)
-        nodes = union(points[:50] * factor).closest
-        return union(points * factor), patches_of(mesh, nodes, [hull.vertices for hull in hulls])
-
-    (found, surface), (usual, other) = measured(size), measured(1.0)
-    np.testing.assert_allclose(found.distance / size, usual.distance, atol=2e-6)
-    np.testing.assert_allclose(surface["node"] / size, other["node"], atol=2e-6)
-    np.testing.assert_array_equal(surface["patch"], other["patch"])
-
-    def labels(of: dict[str, np.ndarray], factor: float) -> np.ndarray:
-        at = np.round((np.clip(points, *union_box) * factor - of["label_low"]) / of["label_cell"]).astype(int)
-        return of["label"][tuple(at.T)]
-
-    union_box = np.concatenate(pieces).min(0), np.concatenate(pieces).max(0)
-    # A rounding of a place to the next of the lattice may tell the other piece, where both are as near.
-    assert (labels(surface, size) == labels(other, 1.0)).mean() > 0.98
 
 
 def test_bodies_of_any_scale_share_one_geometry(block):

@@ -68,6 +68,7 @@ def test_memory_that_stays_does_not_leak_between_calls(monkeypatch: pytest.Monke
     whole = net(points)
     monkeypatch.setitem(mlp.SWEPT, "cpu", 64)
     parts = net(points)
+    assert net(torch.zeros(0, 3))[1].shape == (0, 3) and net(points.numpy())[0].dtype == np.float64
     again = [net(points[start : start + 100]) for start in range(0, 1000, 100)]
     for i in range(2):
         torch.testing.assert_close(parts[i], whole[i], rtol=1e-4, atol=1e-6)
@@ -116,15 +117,3 @@ def test_a_bad_network_cannot_undercut_the_bounding_box() -> None:
     bound = (np.abs(distance - least) < 1e-5) & (least > 0.1)
     assert bound.any()
     np.testing.assert_allclose(np.linalg.norm(gradient[bound], axis=1), 1.0, atol=1e-4)
-
-
-def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> None:
-    sdf = network(3)
-    assert sdf(torch.zeros(0, 3))[1].shape == (0, 3)
-    points = torch.rand(1000, 3)
-    whole = sdf(points)
-    monkeypatch.setattr(mlp, "PREPARED", 37)
-    for one, other in zip(whole, replace(sdf)(points), strict=True):
-        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
-    array, _ = sdf(points.double().numpy())
-    assert array.dtype == np.float64

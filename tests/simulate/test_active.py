@@ -8,7 +8,6 @@ import torch
 
 from sdfsim.geometry import primitives
 from sdfsim.learned import inference
-from sdfsim.learned.contact_graph import ContactGraph
 from sdfsim.learned.graphs import sdf_sim_graph
 from sdfsim.learned.surfaces import predict
 from sdfsim.learned.tensors import state_arrays
@@ -18,7 +17,7 @@ from sdfsim.shape import contact_geometry
 from sdfsim.shape.make import analytic_shape, mesh_shape
 from sdfsim.simulate.simulator import Simulator
 from tests.helpers.scenes import contact_edges, make_body, random_model, surface_model
-from tests.physics.test_missed_contacts import joined
+from tests.helpers.shapes import joined
 
 
 def same(one, other) -> bool:
@@ -82,58 +81,11 @@ def test_an_effect_that_is_off_equals_a_scene_without_it(dropped, effect):
     assert not same(off, Simulator(dropped, model).run(steps=8)) and off.contact_count.sum() > 0
 
 
-def with_scenery(scene: Scene, count: int) -> Scene:
-    far = tuple(
-        make_body(f"far{k}", 0, [1000 + 3 * k, 5 * (k % 7), 1], motion="static", mass=0.0) for k in range(count)
-    )
-    return replace(scene, bodies=scene.bodies + far)
-
-
-@pytest.mark.parametrize("make", [lambda: random_model("impulse"), surface_model])
-def test_scenery_far_away_is_never_asked(dropped, make):
-    few, many = Simulator(with_scenery(dropped, 3), make()), Simulator(with_scenery(dropped, 400), make())
-    one, other = few.run(steps=8), many.run(steps=8)
-    assert (one.position[:, :4] == other.position[:, :4]).all()
-    for name in ("pairs", "contacts", "nodes", "edges", "active", "free"):
-        assert (one.counters[name] == other.counters[name]).all(), name
-    assert one.counters["edges"].sum() > 0
-
-
 def seen_by(model) -> list:
     """The graphs that a network in torch is given."""
     graphs, real = [], model.network.forward
     model.network.forward = lambda graph, **options: graphs.append(graph) or real(graph, **options)
     return graphs
-
-
-@pytest.fixture
-def graphs(monkeypatch) -> list[ContactGraph]:
-    """The graphs that the network on bodies is given."""
-    found, make = [], inference.step_graph
-
-    def made(*given):
-        found.append(make(*given))
-        return found[-1]
-
-    monkeypatch.setattr(inference, "step_graph", made)
-    return found
-
-
-def test_the_impulse_network_sees_only_bodies_that_met_somebody(dropped, graphs):
-    sim = Simulator(dropped, random_model("impulse"))
-    met = 0
-    for _ in range(8):
-        before = len(graphs)
-        sim.run(steps=1)
-        counts = sim.carry.counts
-        assert len(graphs) - before == (counts["edges"] > 0)
-        if len(graphs) > before:
-            graph = graphs[-1]
-            assert counts["nodes"] == len(graph.inverse_mass) < len(dropped.bodies)
-            assert counts["edges"] == len(graph.gap)
-            assert {*graph.first.tolist(), *graph.second.tolist()} == set(range(len(graph.inverse_mass)))
-            met += 1
-    assert met > 0
 
 
 def test_the_paper_network_sees_only_bodies_with_an_edge_and_answers_as_for_all(dropped):
@@ -162,36 +114,6 @@ def test_every_dynamic_body_is_counted_once_while_it_flies_touches_and_falls_asl
 
 
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
-TURNED = np.array([0.0, 0.0, np.sin(0.4), np.cos(0.4)])
-
-
-def paddle(scene: Scene) -> Scene:
-    """A box that sweeps through `low` of the dropped scene while it turns."""
-    path = Waypoints(
-        np.array([0.0, 0.1, 0.2]),
-        np.array([[-1.0, 0, 0.6], [0.5, 0, 0.6], [0.5, 1, 0.6]]),
-        np.stack([STILL, TURNED, STILL]),
-    )
-    body = make_body("paddle", 0, [-1, 0, 0.6], motion="kinematic", mass=0.0, path=path)
-    return replace(scene, bodies=(*scene.bodies, body))
-
-
-def test_a_body_on_a_path_pushes_and_is_not_pushed(dropped):
-    sim = Simulator(paddle(dropped))
-    rollout = sim.run(steps=max(4, round(0.25 / sim.dt)))
-    want = np.stack(
-        [np.interp(rollout.time, [0.0, 0.1, 0.2], [p[k] for p in [(-1, 0), (0.5, 0), (0.5, 1)]]) for k in (0, 1)], -1
-    )
-    np.testing.assert_allclose(rollout.position[:, 4, :2], want, atol=1e-9)
-    half = np.interp(rollout.time, [0.0, 0.1, 0.2], [0.0, 0.8, 0.0])
-    np.testing.assert_allclose(
-        2 * np.arctan2(rollout.orientation[:, 4, 2], rollout.orientation[:, 4, 3]), half, atol=1e-9
-    )
-    met = (rollout.contact_body == [1, 4]).all(1) | (rollout.contact_body == [4, 1]).all(1)
-    assert met.any()
-    # What the bodies beside it do is another motion than without it.
-    without = Simulator(dropped).run(steps=len(rollout))
-    assert np.abs(rollout.position[-1, 1] - without.position[-1, 1]).max() > 1e-4
 
 
 def test_scripted_bodies_do_not_meet_scenery():

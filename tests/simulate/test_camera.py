@@ -74,14 +74,6 @@ def test_two_boxes_are_told_apart_and_what_is_behind_the_camera_is_not_seen():
     assert (body == 0).sum() == pytest.approx((0.4 * scale / 3.8) ** 2, rel=0.06)
 
 
-def test_inside_a_room_every_pixel_sees_a_wall():
-    walls = {f"wall{k}": {"plane": {"normal": n, "offset": -2.0}} for k, n in enumerate([*np.eye(3), *-np.eye(3)])}
-    _, depth, body = Camera((0, -1, 0.0), (0, 1, 0), width=90, height=90, fov=90.0).image(still(**walls))
-    assert np.isfinite(depth).all() and body[45, 45] == 4 and depth[45, 45] == pytest.approx(3.0)
-    assert body[45, 0] == 0 and body[45, -1] == 3 and body[0, 45] == 5 and body[-1, 45] == 2
-    assert depth[45, -1] == pytest.approx(2.0 / (44.5 / 45), rel=1e-5)
-
-
 def test_its_pixels_are_those_of_opencv_and_colmap():
     import cv2
 

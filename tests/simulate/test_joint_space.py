@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sdfsim import Scene, SdfsimError, Simulator, export
+from tests.helpers.mujoco_start import at_start
 
 POSITIONS = np.array([0.5, 0.1, 0.3, -0.4, 0.8, 1.0])
 VELOCITIES = np.array([0.7, -0.2, 1.1, 0.4, -0.6, 0.9])
@@ -107,9 +108,7 @@ def test_jacobians_and_masses_are_those_of_mujoco(tmp_path: Path, base: str | No
 
     scene = robot()
     export(scene.load(), tmp_path / "robot.xml")
-    model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
-    data, simulator = mujoco.MjData(model), Simulator(scene)
-    mujoco.mj_resetDataKeyframe(model, data, 0)
+    (model, data), simulator = at_start(tmp_path / "robot.xml"), Simulator(scene)
     simulator.set_joints(POSITIONS)
     for name, place in simulator.joint_columns.items():
         at = model.jnt_qposadr[model.joint(name).id]

@@ -10,7 +10,7 @@ from sdfsim.learned.model import load_model
 from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.steps import COUNTS, PHASES
 from sdfsim.physics.validity import FARTHEST, FASTEST
-from sdfsim.scene.scene import Effects, Scene, Waypoints
+from sdfsim.scene.scene import Scene, Waypoints
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import SimulationError, Simulator
 from tests.helpers.scenes import make_body, random_model, surface_model
@@ -34,17 +34,6 @@ def resting() -> Simulator:
     sim.step(60)
     assert sim["box"].asleep and sim["other"].asleep
     return sim
-
-
-@pytest.mark.parametrize("contact", ["auto", "off"])
-@pytest.mark.parametrize("kind", MODELS)
-def test_steps_in_one_call_are_the_steps_one_by_one(dropped, kind, contact):
-    sim = Simulator(replace(dropped, effects=Effects(contact=contact)), MODELS[kind]())
-    made = sim.stepper.advance(sim.state, sim.stepper.init(sim.bodies, sim.state, sim.options), 6)
-    sim.step(6)
-    for name in NAMES:
-        np.testing.assert_array_equal(getattr(made.state, name), getattr(sim.state, name), err_msg=name)
-    assert made.counts["active"] == sim.carry.counts["active"]
 
 
 def busy() -> Scene:
@@ -203,16 +192,6 @@ def test_a_restored_state_goes_on_as_the_run_did_here_and_elsewhere(dropped, kin
             np.testing.assert_array_equal(getattr(again, name), getattr(once, name), err_msg=name)
 
 
-def test_a_state_of_the_solver_is_taken_up_by_a_network_on_surface_nodes(dropped):
-    one, other, third = (Simulator(dropped, surface_model()) for _ in range(3))
-    bare = replace(one.state, earlier_position=None, earlier_orientation=None)
-    other.restore(bare)
-    third.state = bare
-    one, other, third = (sim.run(steps=5) for sim in (one, other, third))
-    np.testing.assert_array_equal(other.position, one.position)
-    np.testing.assert_array_equal(third.position, one.position)
-
-
 def test_a_state_that_cannot_be_is_not_restored(dropped):
     sim = Simulator(dropped)
     with pytest.raises(SdfsimError, match="body 'floor': velocity is not finite"):
@@ -253,16 +232,3 @@ def test_all_wake_under_another_gravity():
     for name in ("box", "other"):
         assert not sim[name].asleep
         assert sim[name].velocity[2] == pytest.approx(G * 5 * sim.dt, rel=0.1)
-
-
-def test_effects_may_be_changed_amid_a_run():
-    sim = resting()
-    before = sim.options
-    sim.options = before._replace(friction=False)
-    sim["other"].velocity = (1.0, 0, 0)
-    sim.step(10)
-    assert sim["other"].velocity[0] == pytest.approx(1.0, abs=1e-9)
-    sim.options = before
-    sim.step(10)
-    mu = 0.5 * 0.5  # of box and floor
-    assert sim["other"].velocity[0] == pytest.approx(1.0 - mu * G * 10 * sim.dt, rel=0.02)

@@ -1,4 +1,4 @@
-"""Public recordings by name: fetched from a server in the test, checked, and made into a file that identify reads."""
+"""Public shapes and recordings by name: fetched from a server in the test, checked, kept; and what is refused."""
 
 import hashlib
 import io
@@ -16,7 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from sdfsim.apps.observed import load_recordings
 from sdfsim.base.errors import SdfsimError
+from sdfsim.data import public_shapes
 from sdfsim.data import public_tosses as room
+from sdfsim.data.public_shapes import SUMS, public_folder
 from sdfsim.data.public_tosses import NORMAL, SETS, TILTED, Links, links_of, lowest, public_tosses, upright
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True)
@@ -25,6 +27,23 @@ TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True)
 class Quiet(SimpleHTTPRequestHandler):
     def log_message(self, *arguments):
         """Nothing on stderr."""
+
+
+def served(folder: Path) -> tuple[ThreadingHTTPServer, str]:
+    """A server of a folder, and its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    return server, f"http://127.0.0.1:{server.server_port}"
+
+
+def archived(members: dict[str, bytes]) -> bytes:
+    """A .tar.gz of these files."""
+    with tarfile.open(fileobj=(made := io.BytesIO()), mode="w:gz") as archive:
+        for name, content in members.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    return made.getvalue()
 
 
 def cube_rows(count: int) -> np.ndarray:
@@ -54,12 +73,7 @@ def packed(name: str) -> tuple[bytes, str]:
         torch.save(torch.from_numpy(rows(count)), file := io.BytesIO())
         content[f"x-1/assets/{folder}/{k}.pt"] = file.getvalue()
         hashed.update(file.getvalue())
-    with tarfile.open(fileobj=(made := io.BytesIO()), mode="w:gz") as archive:
-        for path, data in content.items():
-            member = tarfile.TarInfo(path)
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
-    return made.getvalue(), hashed.hexdigest()
+    return archived(content), hashed.hexdigest()
 
 
 @pytest.fixture(params=list(SETS))
@@ -71,9 +85,8 @@ def site(request, tmp_path, monkeypatch):
     file = root / known.repository / "tar.gz" / known.commit
     file.parent.mkdir(parents=True)
     file.write_bytes(content)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(root)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    monkeypatch.setattr(room, "GITHUB", f"http://127.0.0.1:{server.server_port}")
+    server, address = served(root)
+    monkeypatch.setattr(room, "GITHUB", address)
     monkeypatch.setattr(room, "SETS", {name: known})
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -144,18 +157,94 @@ def test_elbows_of_the_first_session_are_turned_onto_the_table():
     assert upright(seen, TILTED) is seen
 
 
-def test_the_first_session_of_the_elbow_lies_as_it_is_told(data_dir):
-    """Faces on which links came to rest are level then, in both sessions."""
-    file = np.load(data_dir / "tosses" / "elbow.npz")
-    normals: list[list[np.ndarray]] = [[], []]
-    for number, a, b in zip(file["number"], file["start"][:-1], file["start"][1:], strict=True):
-        place, turn, angle = (file[n][a:b].astype(float) for n in ("position", "quat_xyzw", "hinge"))
-        links = upright(links_of(place, Rotation.from_quat(turn), angle), int(number))
-        if np.linalg.norm(np.diff(links.position[-10:], axis=0), axis=-1).max() < 2e-4:
-            for axes in Rotation.from_quat(links.quat_xyzw[-1]).as_matrix():
-                most = np.abs(axes[2]).argmax()
-                if abs(axes[2, most]) > np.cos(np.radians(6.0)):
-                    normals[int(number >= TILTED)].append(axes[:, most] * np.sign(axes[2, most]))
-    for some in normals:
-        assert len(some) > 80
-        assert np.degrees(np.abs(np.median(some, axis=0)[:2])).max() < 0.2
+VISUAL, COLLISION, SCAN = "cone/visual_geometry.obj", "cone/collision_geometry.obj", "ycb_soup_can.obj"
+CONTENT = {VISUAL: b"v 0 0 1\n", COLLISION: b"v 0 0 2\n", SCAN: b"v 0 0 3\n"}
+
+
+class Site:
+    """A server of a folder, and a cache to fetch into."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root / "shop"
+        self.root.mkdir()
+        self.cache = root / "cache"
+        self.server, self.url = served(self.root)
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+
+    def pack(self, members: dict[str, bytes]) -> None:
+        (self.root / "cone.tar.gz").write_bytes(archived(members))
+
+    def kept(self) -> list[Path]:
+        return [file for file in self.cache.rglob("*") if file.is_file()]
+
+
+@pytest.fixture
+def shop(tmp_path, monkeypatch):
+    shop = Site(tmp_path)
+    sums = {file: hashlib.sha256(content).hexdigest() for file, content in CONTENT.items()}
+    monkeypatch.setattr(public_shapes, "KUBRIC", shop.url)
+    monkeypatch.setattr(public_shapes, "YCB", shop.url)
+    monkeypatch.setattr(public_shapes, "SUMS", {"kubasic": {f: sums[f] for f in (VISUAL, COLLISION)},
+                                                "ycb": {SCAN: sums[SCAN]}})  # fmt: skip
+    monkeypatch.setenv("XDG_CACHE_HOME", str(shop.cache))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.chdir(tmp_path)
+    scan = shop.root / "YcbSoupCan" / "textured_simple_reoriented.obj"
+    scan.parent.mkdir()
+    scan.write_bytes(CONTENT[SCAN])
+    shop.pack({"cone/data.json": b"{}", **{file: CONTENT[file] for file in (VISUAL, COLLISION)}})
+    yield shop
+    shop.close()
+
+
+@pytest.mark.parametrize("name", ["kubasic", "ycb"])
+def test_a_set_is_fetched_once(shop, name):
+    said = []
+    folder = public_folder(Path(name), lambda fraction, message: said.append(message))
+    assert folder == shop.cache / "sdfsim" / "public" / name
+    assert {str(file.relative_to(folder)): file.read_bytes() for file in shop.kept()} == {
+        file: CONTENT[file] for file in public_shapes.SUMS[name]
+    }
+    assert len(said) == 1 and shop.url in said[0]
+    shop.close()
+    assert public_folder(Path(name)) == folder
+
+
+def test_a_file_with_another_sum_is_refused_and_nothing_kept(shop):
+    shop.pack({VISUAL: CONTENT[VISUAL], COLLISION: b"v 6 6 6\n"})
+    with pytest.raises(SdfsimError, match=r"cone\.tar\.gz: collision_geometry\.obj: ") as caught:
+        public_folder(Path("kubasic"))
+    for content in (b"v 6 6 6\n", CONTENT[COLLISION]):
+        assert hashlib.sha256(content).hexdigest() in caught.value.message
+    assert not shop.kept()
+
+
+def test_a_path_in_an_archive_leads_nowhere(shop, tmp_path):
+    before = set(tmp_path.rglob("*"))
+    shop.pack({"../../../outside.obj": b"", str(tmp_path / "outside.obj"): b"", "../../" + VISUAL: CONTENT[VISUAL],
+               "../" + COLLISION: CONTENT[COLLISION]})  # fmt: skip
+    folder = public_folder(Path("kubasic"))
+    assert sorted(shop.kept()) == [folder / COLLISION, folder / VISUAL]
+    assert {path for path in tmp_path.rglob("*") if not path.is_relative_to(shop.cache)} == before
+
+
+def test_without_a_network_it_says_which_shapes_to_put_where(shop):
+    shop.close()
+    folder = shop.cache / "sdfsim" / "public" / "kubasic"
+    with pytest.raises(SdfsimError, match=f"(?m)^{shop.url}/cone.tar.gz: .*refused$") as caught:
+        public_folder(Path("kubasic"))
+    assert caught.value.hint == f"put these files into {folder} by hand: {VISUAL}, {COLLISION}"
+    for file in (VISUAL, COLLISION):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_bytes(CONTENT[file])
+    assert public_folder(Path("kubasic")) == folder
+
+
+@pytest.mark.parametrize(("name", "folder", "count"), [("kubasic", "kubasic", 22), ("ycb", "meshes", 6)])
+def test_the_sums_are_those_of_the_files_at_hand(data_dir, name, folder, count):
+    assert len(SUMS[name]) == count
+    for file, expected in SUMS[name].items():
+        assert hashlib.sha256((data_dir / folder / file).read_bytes()).hexdigest() == expected, file

@@ -1,3 +1,0 @@
-from tests.helpers.scenes import box_shape, dropped, free_pair
-
-__all__ = ["box_shape", "dropped", "free_pair"]
