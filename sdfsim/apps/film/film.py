@@ -17,7 +17,19 @@ from sdfsim.apps.film.frames import Clip, read_clip
 from sdfsim.apps.film.recording import recording_of
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.film.supports import behind_others, supported, with_paths
-from sdfsim.apps.film.track import Film, Shutter, Track, again, deepened, either, find, follow, masks, shutter_of
+from sdfsim.apps.film.track import (
+    Film,
+    Shutter,
+    Track,
+    again,
+    deepened,
+    either,
+    find,
+    follow,
+    masks,
+    shutter_of,
+    without_others,
+)
 from sdfsim.apps.identify.filmed import Filmed, identify_films
 from sdfsim.apps.identify.report import Identified
 from sdfsim.apps.observed import Recording, movers
@@ -99,7 +111,8 @@ def watched(
         others = [either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
         k = max(one.frames.tolist(), key=lambda k: one.at(k).score)
         full = follow(clip, back, one.look, eye, shutter, k, one.at(k), gravity, others, on_progress)
-        refined.append(deepened(clip, eye, again(clip, back, eye, shutter, full, others)))
+        full = without_others(clip, eye, again(clip, back, eye, shutter, full, others))
+        refined.append(deepened(clip, eye, full))
     tracks = refined
     for body, one in zip([*led, *moving], [*supports, *tracks], strict=True):
         _judged(clip, one, body.name)

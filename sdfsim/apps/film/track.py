@@ -28,12 +28,15 @@ TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much l
 WORSE = 0.03  # score below the best, from which the best's orientation is tried again
 SAME, SAME_TURN = 0.2, 0.01  # px, and rad, between predictions that count as one
 JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
+NEARER, APPROACH = 0.05, 5.0  # share of the distance to the camera, and m/s, by which it changes at most
+BACK = 0.3  # share of that distance by which it may differ from the scene's at first, or after the body was lost
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
 GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is lost
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
 FAR = 6  # frames for which a lost body is looked for where it would fly
 TWIN = 0.85  # score of each of two things that may both be the body
 OTHER = 60.0  # levels by which a ball's colour never differs from that in other frames
+DIM = 0.25  # score below the median of a film, of frames that do not count
 HUE, FAINT = 0.08, 10.0  # how much hues of one thing differ; levels that are noise
 SHUTTERS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of the time between frames
 SPREADS = (0.0, 0.6, 1.0, 1.6)  # px
@@ -117,6 +120,8 @@ def find(
     frame = frame_of(clip, back, 0, way=-1)
     begun = fitted(look, eye, frame, place, turn, none, 0.7, None, wide=2.5, turned=False)
     begun = begun and fitted(look, eye, frame, begun.place, begun.turn, none, 0.7, None)
+    if begun is not None and not look.ball and _distant(eye, begun.place, place):
+        begun = None
     if begun is not None:
         found.append((0, begun))
         turns = turns[: 1 + FEWER] if begun.score > GOOD else turns
@@ -125,8 +130,8 @@ def find(
         # A place where the body rests for long, before or after, differs from the median when it is free.
         for blob in blobs(frame, (back.first, back.last)):
             tried = []
-            for guess in guesses(look, eye, blob, place, turns):
-                rough = fitted(look, eye, frame, *guess, none, 0.7, None, rounds=6, wide=2.5)
+            for n, guess in enumerate(guesses(look, eye, blob, place, turns)):
+                rough = fitted(look, eye, frame, *guess, none, 0.7, None, rounds=6, wide=2.5, turned=n > 0)
                 if rough is not None:
                     tried.append(rough)
                 if rough is not None and rough.score > 0.9:
@@ -151,8 +156,12 @@ def find(
         way = pose.to_rotvec(pose.multiply(item[1].turn, pose.conjugate(turn)))
         return (1.0 - item[1].score) * (1.0 if look.ball or np.linalg.norm(way) < TURNED else OTHERWISE)
 
-    usual = _hue(begun if begun is not None and begun.score > GOOD else max(found, key=lambda item: item[1].score)[1])
-    found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE]
+    if not look.ball:  # a hand before a body looks like it, but larger
+        found = [item for item in found if not _distant(eye, item[1].place, place)] or found
+    # What is seen in most frames: a hand leaves soon.
+    best_of = {k: max((one for j, one in found if j == k), key=lambda one: one.score) for k, _ in found}
+    usual = np.median([_hue(one) for one in best_of.values()], 0)
+    found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE] or found
     k, best = min(found, key=unlikely)
     if free and _twins(found, look):
         raise SdfsimError(
@@ -197,7 +206,34 @@ def follow(
             frame = frame_of(clip, back, at, hidden[at] if hidden else None, way)
             seen[at] = _next(clip, look, eye, shutter, frame, at, [(j, seen[j]) for j in before], first, gravity)
             on_progress(0.0, f"frame {at}")
-    return Track(look, seen)
+    return without_others(clip, eye, Track(look, seen))
+
+
+def without_others(clip: Clip, eye: Eye, track: Track) -> Track:
+    """The track without frames in which something else was followed, as a hand before the body, or a place that it
+    left: in most frames it is seen in another colour, or much better, or elsewhere just before or after."""
+    rows = track.frames
+    if track.look.support or not len(rows):
+        return track
+    hues, scores = np.array([_hue(track.at(k)) for k in rows]), np.array([track.at(k).score for k in rows])
+    alike = (np.abs(hues - np.median(hues, 0)).max(1) < HUE) | bool(track.look.ball)
+    rows = rows[alike & (scores > np.median(scores) - DIM)]
+    best = max(rows.tolist(), key=lambda k: track.at(k).score)
+    seen: list[Seen | None] = [None] * len(track.seen)
+    seen[best] = track.at(best)
+    for order in (rows[rows > best], rows[rows < best][::-1]):
+        last = best
+        for k in order.tolist():
+            if not _jumps(track.look, eye, track.at(k), track.at(last), clip.time[k] - clip.time[last]):
+                last, seen[k] = k, track.at(k)
+    return Track(track.look, seen)
+
+
+def _jumps(look: Look, eye: Eye, one: Seen, last: Seen, later: float) -> bool:
+    """Whether a body is nearer or farther than it can be `later` s after it was seen last: what is before it looks
+    like it, but larger."""
+    depth = float(eye.seen(last.place)[2])
+    return not look.ball and abs(float(eye.seen(one.place)[2]) - depth) > NEARER * depth + APPROACH * abs(later)
 
 
 def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen | None:
@@ -206,7 +242,9 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
             for guess in guesses(look, eye, blob, first.place, [first.turn]):
                 one = fitted(look, eye, frame, *guess, np.zeros(2), shutter.spread, first.color, wide=2.5)
                 one = one and fitted(look, eye, frame, one.place, one.turn, np.zeros(2), shutter.spread, first.color)
-                if one is not None and one.score > GOOD and not _repainted(look, one, first):
+                if one is None or one.score < GOOD or _distant(eye, one.place, first.place):
+                    continue
+                if np.abs(_hue(one) - _hue(first)).max() < HUE and not _repainted(look, one, first):
                     return one
         return None
     best, least = None, np.inf
@@ -225,7 +263,11 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
                      turned=not wide)  # fmt: skip
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
-        if one is not None and not _repainted(look, one, first) and odd(one, likely) < least:
+        if one is None or _repainted(look, one, first):
+            continue
+        if _jumps(look, eye, one, before[0][1], clip.time[at] - clip.time[before[0][0]]):
+            continue
+        if odd(one, likely) < least:
             best, least = one, odd(one, likely)
     if best is not None and best.score < first.score - WORSE and not look.ball:  # it may have been mistaken before
         place, turn, flow = best.place, first.turn, likely[0][2]
@@ -242,6 +284,11 @@ def odd(one: Seen, likely: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) 
     nearly alike when it is tilted to either side."""
     turns = [np.linalg.norm(pose.to_rotvec(pose.multiply(one.turn, pose.conjugate(turn)))) for _, turn, _ in likely]
     return (1.0 - one.score) * (1.0 + float(min(turns)) / JUMP)
+
+
+def _distant(eye: Eye, place: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two places [3] are not about as far from the camera."""
+    return bool(abs(np.log(eye.seen(place)[2] / eye.seen(other)[2])) > BACK)
 
 
 def _repainted(look: Look, one: Seen, first: Seen) -> bool:
