@@ -35,7 +35,7 @@ from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:  # numba and torch are slow to load
     from sdfsim.learned.impulse import ImpulseNetwork
-    from sdfsim.learned.near import Contacts
+    from sdfsim.learned.surfaces import Contacts
     from sdfsim.learned.tensors import BodyTensors
     from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 
@@ -249,9 +249,8 @@ class OnSurfaces(Stepper):
         return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
-        from sdfsim.learned.graphs import points
-
-        return points(shape, self.model.nodes)
+        """The shape with its first nodes: the outermost ones, then the most evenly spread."""
+        return replace(shape, nodes=shape.nodes[: self.model.nodes])
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         return with_history(state, bodies, options)
@@ -266,7 +265,7 @@ class OnSurfaces(Stepper):
         """The edges were found at the start of the step; their points are returned for the poses of `state`."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
-        from sdfsim.learned.near import where
+        from sdfsim.learned.surfaces import where
         from sdfsim.learned.tensors import state_tensors
 
         pairs = np.stack([near.owner.cpu().numpy(), near.body.cpu().numpy()], -1)
@@ -288,9 +287,7 @@ class OnSurfaces(Stepper):
     def _step(self, state: State, carry: Carry) -> State:
         import torch
 
-        from sdfsim.learned.graphs import sdf_sim_graph
-        from sdfsim.learned.near import find_contacts, no_contacts
-        from sdfsim.learned.surfaces import compact, predict
+        from sdfsim.learned.surfaces import compact, find_contacts, no_contacts, predict, sdf_sim_graph
         from sdfsim.learned.tensors import state_tensors
 
         options, tensors = carry.options, self._tensors(carry)
