@@ -40,13 +40,9 @@ class MeshSdf:
         if len(self.mesh.faces) == 0:
             raise SdfsimError("mesh has no faces")
 
-    @property
+    @cached_property
     def bounds(self) -> np.ndarray:
         """[2, 3] float64 m, the box of the faces' corners."""
-        return self._box
-
-    @cached_property
-    def _box(self) -> np.ndarray:
         corners = self.mesh.vertices[np.unique(self.mesh.faces)]
         return np.stack([corners.min(0), corners.max(0)])
 

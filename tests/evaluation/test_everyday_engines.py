@@ -30,8 +30,21 @@ from benchmarks.rivals import in_pieces
 from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, still
-from sdfsim.evaluation.laws.check import Check, most, near
-from sdfsim.evaluation.laws.scenes import UNIT, G, Law, Put, Setting, about, fixed, floor, run, solid
+from sdfsim.evaluation.laws.scenes import (
+    UNIT,
+    Check,
+    G,
+    Law,
+    Put,
+    Setting,
+    about,
+    fixed,
+    floor,
+    most,
+    near,
+    run,
+    solid,
+)
 from sdfsim.evaluation.laws.table import ROWS
 from sdfsim.scene.scene import Joint, Scene
 

@@ -23,6 +23,7 @@ import numpy as np
 from sdfsim.apps.play.hand import Hand
 from sdfsim.apps.play.saved import save_run, save_scene
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.lazy import made_once
 from sdfsim.evaluation.instruments import judged
 from sdfsim.geometry.bvh import Caster
 from sdfsim.physics import pose
@@ -92,7 +93,6 @@ class Session:
         self.middle, self.wide = framed(simulator.scene)  # of the start: balls that were thrown fly far
         self._kept: deque[tuple[float, Snapshot, int]] = deque()  # time, snapshot, bytes
         self._passed: deque[tuple[float, float]] = deque()  # real and simulated time
-        self._casters: dict[int, tuple[Shape, Caster]] = {}  # by the id of the shape, which is kept with it
         self._record()
         self._keep()
         self._show()
@@ -381,11 +381,8 @@ class Session:
             if is_infinite(shape):
                 away = -start[2] / way[2] if way[2] < 0.0 else np.inf
             else:
-                if id(shape) not in self._casters:
-                    self._casters[id(shape)] = shape, Caster(shape.mesh)
-                caster = self._casters[id(shape)][1]
                 ray = np.concatenate([start / body.scale + shape.com, way / body.scale]).astype(np.float32)
-                away = float(caster.cast(ray[None])[0][0])
+                away = float(made_once(shape.mesh, Caster).cast(ray[None])[0][0])
             if 0.0 < away < (np.inf if best is None else best[1]):
                 best = body.name, away
         return best

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Ran, Setting, about, fixed, floor, run, run_built, solid
+from sdfsim.evaluation.laws.scenes import UNIT, Check, G, Put, Ran, Setting, about, fixed, floor, run, run_built, solid
 from sdfsim.geometry.mesh import Mesh, clean, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box, cylinder, revolve, ring, sleeve, torus, tube
