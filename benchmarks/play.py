@@ -6,8 +6,6 @@ A drag's time is from the message's leaving to the pose that it led to being sen
 `samples/large.py heaps`; without it this row is left out.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -4,8 +4,6 @@ A place that no photo sees takes the sign of the nearest place that one does: th
 air beyond a picture's edge is empty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

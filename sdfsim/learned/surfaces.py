@@ -9,8 +9,6 @@ edge.
 The network predicts an acceleration for every surface node; shape matching turns those of a body into its next pose.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The page on which a person plays with a session: the mouse, the keys and the panel."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ It knows nothing of pages. `Session.call` runs a command between two steps. With
 once, and `advance` or `step` makes steps.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
