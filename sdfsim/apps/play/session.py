@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from sdfsim.apps.play.hand import Hand
-from sdfsim.apps.play.saved import save_run, save_scene
+from sdfsim.apps.play.saved import save_scene, write_run
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.lazy import made_once
 from sdfsim.evaluation.instruments import judged
@@ -428,7 +428,7 @@ class Session:
     def save_run(self, folder: Path | str) -> Path:
         """Write the motion since the scene was changed last as a run folder. Raises SdfsimError as `save_scene`."""
         scene, rollout = self.call(lambda: (self.simulator.scene, self.recording.rollout))
-        return save_run(at_frame(scene, rollout), rollout, Path(folder))
+        return write_run(at_frame(scene, rollout), rollout, Path(folder))
 
     def _put(self, name: str, shape: Shape, body: Body, spot: Any = None, **fields: Any) -> str:
         """Add a body of a shape; with a `spot` so high above it that it lies free."""
