@@ -20,7 +20,7 @@ from sdfsim.scene.builder import SceneBuilder, plain
 from sdfsim.scene.joints import joint_axes
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf, TorusSdf
+from sdfsim.sdf.closed_forms import ClosedForm, sizes_in_scene
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.looks import is_infinite
 from sdfsim.simulate.record import Recording, at_frame
@@ -80,20 +80,8 @@ def save_run(simulator: Simulator, run: Recording | Rollout, folder: Path | str)
 
 
 def _shape(shape: Shape, folder: Path) -> dict[str, Any]:
-    sdf = shape.sdf
-    if set(shape.source) == {"kind"}:
-        if isinstance(sdf, SphereSdf):
-            return {"sphere": {"radius": sdf.radius}}
-        if isinstance(sdf, BoxSdf):
-            return {"box": {"size": [2.0 * half for half in sdf.half]}}
-        if isinstance(sdf, CapsuleSdf):
-            return {"capsule": {"radius": sdf.radius, "height": 2.0 * (sdf.half + sdf.radius)}}
-        if isinstance(sdf, CylinderSdf):
-            return {"cylinder": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
-        if isinstance(sdf, ConeSdf):
-            return {"cone": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
-        if isinstance(sdf, TorusSdf):
-            return {"torus": {"radius": sdf.radius, "tube": sdf.tube}}
+    if set(shape.source) == {"kind"} and isinstance(shape.sdf, ClosedForm):
+        return {shape.sdf.KIND: sizes_in_scene(shape.sdf)}
     return {"asset": shape.save(folder).resolve()}
 
 
