@@ -10,6 +10,7 @@ The network predicts an acceleration for every surface node; shape matching turn
 """
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from torch import Tensor
 
 from sdfsim.learned import pose
 from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, Layout, MultiGraph
-from sdfsim.learned.tensors import BodyTensors, StateTensors, state_arrays
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.motion import Motion
 from sdfsim.physics.solver.prepare import Compiled, nodes_near
 
 NODE = Features(13, (0, 3, 6))  # features of surface nodes and of body nodes
@@ -35,6 +37,52 @@ TARGET = Features(3, (0,))  # accelerations
 # so it decides only about rotations that the nodes do not define.
 STAY = 1e-12
 _NOT_PER_BODY = ("node", "node_start")
+
+
+@dataclass(frozen=True)
+class BodyTensors:
+    """The fields of `Bodies` that such a network needs, for N bodies with M surface nodes."""
+
+    inverse_mass: Tensor  # [N] float64
+    friction: Tensor  # [N] float64
+    restitution: Tensor  # [N] float64
+    moves: Tensor  # [N] bool
+    size: Tensor  # [N] float64
+    node: Tensor  # [M, 3] float64
+    node_start: Tensor  # [N + 1] int64
+
+    def __len__(self) -> int:
+        return len(self.moves)
+
+    @property
+    def device(self) -> torch.device:
+        return self.moves.device
+
+
+@dataclass(frozen=True)
+class StateTensors:
+    """Poses and velocities of N bodies, float64; see `State`."""
+
+    position: Tensor  # [N, 3]
+    orientation: Tensor  # [N, 4]
+    velocity: Tensor  # [N, 3]
+    angular_velocity: Tensor  # [N, 3]
+    earlier_position: Tensor | None = None  # [2, N, 3]
+    earlier_orientation: Tensor | None = None  # [2, N, 4]
+
+
+def body_tensors(bodies: Bodies, device: torch.device) -> BodyTensors:
+    return BodyTensors(**{f.name: torch.from_numpy(getattr(bodies, f.name)).to(device) for f in fields(BodyTensors)})
+
+
+def state_tensors(state: Motion, device: torch.device) -> StateTensors:
+    arrays = {f.name: getattr(state, f.name, None) for f in fields(StateTensors)}
+    return StateTensors(**{k: torch.from_numpy(v).to(device) for k, v in arrays.items() if v is not None})
+
+
+def state_arrays(state: StateTensors) -> State:
+    tensors: dict[str, Any] = {f.name: getattr(state, f.name) for f in fields(state)}
+    return State(**{k: v.cpu().numpy() for k, v in tensors.items() if v is not None})
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:  # numba and torch are slow to load
     from sdfsim.learned.impulse import ImpulseNetwork
-    from sdfsim.learned.surfaces import Contacts
-    from sdfsim.learned.tensors import BodyTensors
+    from sdfsim.learned.surfaces import BodyTensors, Contacts
     from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 
 FreeFlight = Literal["exact", "learned"]
@@ -265,15 +264,14 @@ class OnSurfaces(Stepper):
         """The edges were found at the start of the step; their points are returned for the poses of `state`."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
-        from sdfsim.learned.surfaces import where
-        from sdfsim.learned.tensors import state_tensors
+        from sdfsim.learned.surfaces import state_tensors, where
 
         pairs = np.stack([near.owner.cpu().numpy(), near.body.cpu().numpy()], -1)
         points = where(state_tensors(state, self.device), self._tensors(carry), near).cpu().numpy()
         return points, pairs, float((-near.distance).clamp_min(0.0).max())
 
     def _tensors(self, carry: Carry) -> BodyTensors:
-        from sdfsim.learned.tensors import body_tensors
+        from sdfsim.learned.surfaces import body_tensors
 
         if carry.tensors is None:
             bodies = carry.bodies
@@ -287,8 +285,14 @@ class OnSurfaces(Stepper):
     def _step(self, state: State, carry: Carry) -> State:
         import torch
 
-        from sdfsim.learned.surfaces import compact, find_contacts, no_contacts, predict, sdf_sim_graph
-        from sdfsim.learned.tensors import state_tensors
+        from sdfsim.learned.surfaces import (
+            compact,
+            find_contacts,
+            no_contacts,
+            predict,
+            sdf_sim_graph,
+            state_tensors,
+        )
 
         options, tensors = carry.options, self._tensors(carry)
         if state.earlier_position is None:  # from a stepper that needs no earlier positions

@@ -11,8 +11,15 @@ from sdfsim.base.files import digest
 from sdfsim.data.batching import centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
 from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
-from sdfsim.learned.surfaces import TARGET, find_contacts, node_owner, sdf_sim_graph, target_acceleration
-from sdfsim.learned.tensors import body_tensors, state_tensors
+from sdfsim.learned.surfaces import (
+    TARGET,
+    body_tensors,
+    find_contacts,
+    node_owner,
+    sdf_sim_graph,
+    state_tensors,
+    target_acceleration,
+)
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.physics.solver.prepare import Compiled, SharedShapes

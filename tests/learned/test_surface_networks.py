@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sdfsim.learned.surfaces import advance, node_owner
-from sdfsim.learned.tensors import state_arrays
+from sdfsim.learned.surfaces import advance, node_owner, state_arrays
 from sdfsim.scene.scene import Effects, Scene
 from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
