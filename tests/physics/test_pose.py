@@ -75,7 +75,7 @@ def test_leading_dimensions_are_batched_over(pose):
     one = np.broadcast_to(A.as_quat()[0], (4, 5, 4)).copy()
     np.testing.assert_allclose(pose.rotate(one, v), A[0].apply(v.reshape(-1, 3)).reshape(v.shape), atol=1e-13)
     for some in (quats[:0], quats[:, :0]):
-        assert pose.multiply(some, some).shape == pose.from_rotvec(some[..., :3]).shape == some.shape
+        assert pose.multiply(some, some).shape == in_numpy.from_rotvec(some[..., :3]).shape == some.shape
 
 
 def test_a_quaternion_of_a_matrix():
