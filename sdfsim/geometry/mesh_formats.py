@@ -2,8 +2,8 @@
 
 trimesh refuses a binary PLY whose faces differ in their number of corners, and an OFF with its counts on the first
 line; it misreads many ways to write OBJ and STL, and drops their materials without a word. Open3D rejects a whole file
-for one polygon with three corners in a line. So all four are read here. All readers raise ValueError for a file that is
-damaged or cut short.
+for one polygon with three corners in a line. So the first four are read here; pycollada reads COLLADA. The readers of
+the four raise ValueError for a file that is damaged or cut short.
 """
 
 import importlib
