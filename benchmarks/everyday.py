@@ -36,8 +36,7 @@ from sdfsim.evaluation.engines import LONGEST, SI, Engine, Ran, Runner, TooSlow,
 from sdfsim.evaluation.harness import Job, Results, measure, one_thread
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws import assembly, everyday, scenes
-from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import Setting
+from sdfsim.evaluation.laws.scenes import Check, Setting
 from sdfsim.evaluation.laws.table import ROWS, checks
 from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.units import scene_units

@@ -137,7 +137,3 @@ def main(*, rounds: int = 5, memory: int = 1_000_000) -> None:
     columns = ("task", "sdfsim, actions/s", "MuJoCo, actions/s", "sdfsim / MuJoCo")
     write_record("learn", "python -m benchmarks learn", str(__doc__).rpartition("\n\n")[2].strip().replace("\n", " "),
                  columns, rows, notes)  # fmt: skip
-
-
-if __name__ == "__main__":
-    main()

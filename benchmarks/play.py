@@ -6,10 +6,9 @@ A drag's time is from the message's leaving to the pose that it led to being sen
 `samples/large.py heaps`; without it this row is left out.
 """
 
-from __future__ import annotations
-
 import threading
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +31,7 @@ class Client:
 
         version = [Subprotocol(f"viser-v{viser.__version__}")]
         self._socket = connect(address.replace("http", "ws"), subprotocols=version, max_size=None)
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread = threading.Thread(target=deque, args=(self._socket, 0), daemon=True)  # nothing is kept
         self._thread.start()
         self.send("ViewerCameraMessage", wxyz=(1.0, 0.0, 0.0, 0.0), position=(1.0, 0.0, 0.0), fov=0.8, near=0.01,
                   far=100.0, image_height=800, image_width=1280, look_at=(0.0, 0.0, 0.0),
@@ -46,10 +45,6 @@ class Client:
     def close(self) -> None:
         self._socket.close()
         self._thread.join()
-
-    def _listen(self) -> None:
-        for _ in self._socket:
-            pass
 
     def drag(self, playing: Playing, name: str, way: np.ndarray) -> None:
         """Drag a body by its centre along the points [K, 3] m."""

@@ -30,16 +30,19 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 import yaml
+from PIL import Image
 from scipy.spatial.transform import Rotation
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "samples" / "photos"))
 
 from benchmarks.records import ROOT, Cell, Out, write_record
 from pipeline.cameras import Similarity, View, load_views
 from pipeline.field.training import HELD_OUT, SCORED, load_field
+from pipeline.mesh.joint import load_held
 from pipeline.mesh.meshing import read_parts
 from pipeline.mesh.placement import load_placement
 from pipeline.mesh.trust import vertex_areas
+from pipeline.stages import reconstruct
+from pipeline.states import reconstruct_states
+from samples.photos import make
 from sdfsim.base.console import Session
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_text
@@ -47,6 +50,7 @@ from sdfsim.geometry.mesh import Mesh, signed_volume
 from sdfsim.geometry.mesh_io import load_mesh, read_attributes, read_mesh
 from sdfsim.shape.shape import load_shape
 from sdfsim.simulate.simulator import Simulator
+from tests.pipeline import photo_sets
 
 PHOTOS = ROOT / "samples" / "photos" / "table_vase"
 TABLE, VASE = 0.55, np.array([0.12, -0.05])  # m: the table's height, and the vase's axis
@@ -205,9 +209,7 @@ def held_out_errors(folder: Path, photos: Path, move: Similarity) -> dict[str, f
     first surface is. `psnr`: of the pixels of the table and what stands on it, dB, as the field renders them.
     `sharpness`: the sum of differences between neighbouring pixels there, as a share of the photos', %.
     """
-    import make
     import open3d as o3d
-    from PIL import Image
 
     about = json.loads((photos / "transforms.json").read_text())
     half = np.array(make.TABLE_SIZE) / 2 + 0.1
@@ -263,8 +265,6 @@ def vase_size(mesh: Any) -> dict[str, float]:
     """Height and depth of the hollow, cm: vertical rays within 2 cm of the axis measure the depth below the rim. Also
     the share of the belly's air, below the neck, that is empty, and the volume of the matter, as a share of the true
     one, both in percent, from random places in the true profiles."""
-    import make
-
     rng = np.random.default_rng(0)
     outer, inner = np.array(make.VASE_OUTER), np.array(make.VASE_INNER)[::-1]
     wide, tall = outer.max(0)
@@ -336,8 +336,6 @@ def evaluate(folder: Path, photos: Path) -> dict[str, Any]:
 def drawn(photos: Path, out: Path) -> Path:
     """The folder of one of make.py's sets: the bundled one, or one next to `out`, made if it does not exist. Any other
     folder is returned unchanged."""
-    import make
-
     name = str(photos)
     if name not in make.SETS:
         return photos
@@ -372,8 +370,6 @@ def body_errors(folder: Path, photos: Path) -> dict[str, dict]:
 
 def clicked(photos: Path) -> dict[str, list[str]]:
     """A place on each body of a rendered set: its middle in the photo that shows most of it."""
-    from PIL import Image
-
     found = {}
     for folder in sorted((photos / "masks").iterdir()):
         masks = {path.stem: np.argwhere(np.asarray(Image.open(path)) > 0) for path in sorted(folder.iterdir())}
@@ -386,9 +382,6 @@ def clicked(photos: Path) -> dict[str, list[str]]:
 
 def touching(out: Path, **options: Any) -> list[tuple[Cell, ...]]:
     """Renders a set of `photo_sets` and reconstructs it in each way: rows with the errors of the bodies."""
-    from pipeline.stages import reconstruct
-    from tests.pipeline import photo_sets
-
     photos, rows = out / "photos", []
     if not photos.exists():
         photo_sets.shoot_bodies(photos, photo_sets.touching)
@@ -410,10 +403,6 @@ def touching(out: Path, **options: Any) -> list[tuple[Cell, ...]]:
 def joint_of(name: str, out: Path, **options: Any) -> list[tuple[Cell, ...]]:
     """Renders both states of an object and reconstructs them together: rows with the errors of the joint, of its axis
     and position, and the travel of the part."""
-    from pipeline.mesh.joint import load_held
-    from pipeline.states import reconstruct_states
-    from tests.pipeline import photo_sets
-
     travel, states = JOINTS[name], [out / "shut", out / "open"]
     for number, (state, moved) in enumerate(zip(states, (0.0, travel), strict=True)):
         if not state.exists():
@@ -490,8 +479,6 @@ def main(
     distance: tuple[str, str, float] | None = None,
     budget: float | None = None,
 ) -> None:
-    from pipeline.stages import reconstruct
-
     options: dict[str, Any] = {"preset": preset, "budget": None if budget is None else 60 * budget}
     name = "room" if photos == PHOTOS else str(photos)
     command = " ".join(["python -m benchmarks reconstruct", *sys.argv[1:]]).replace(str(out), "DIR")

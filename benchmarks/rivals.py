@@ -267,10 +267,6 @@ def compared(data: Path, out: Out) -> Results:
     return measure(jobs, out / "results", where="fresh", on_progress=progress)
 
 
-def why_not(result: dict[str, Any]) -> str:
-    return result.get("failed") or "; ".join(result["broken"].values())
-
-
 def shapes(data: Path, *, out: Out) -> None:
     """Hard shapes: a row for each case and engine at the usual inner step, with the time for equal depth."""
     columns = (
@@ -281,7 +277,7 @@ def shapes(data: Path, *, out: Out) -> None:
     for (case, name), result in compared(data, out).items():
         usual = result.get("inner", {}).get(str(USUAL))
         if usual is None:
-            rows.append((case, name, why_not(result), *[""] * 6))
+            rows.append((case, name, result.get("failed") or "; ".join(result["broken"].values()), *[""] * 6))
             continue
         equal = [one["ms"] for one in result["inner"].values() if one["deep"] <= DEEP and not one["lost"]]
         rows.append((

@@ -31,7 +31,7 @@ from sdfsim.data.batching import scene_of
 from sdfsim.data.dataset import conditions_of
 from sdfsim.evaluation.engines import Engine, Ran, scene_rollout, start_of_scene, timed_rollout
 from sdfsim.evaluation.evaluate import load_recorded
-from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory, why_failed
+from sdfsim.evaluation.harness import Job, measure, one_thread, peak_memory
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws.hard_cases import body, box, on_floor
 from sdfsim.physics.rollout import Rollout
@@ -113,7 +113,7 @@ def jobs_of(folder: Path) -> list[Job]:
 
 def growth(*, out: Out) -> None:
     results = measure(jobs_of(out), out / "results", where="fresh", on_progress=progress)
-    rows = [(*key, *map(found.get, COLUMNS), why_failed(found)) for key, found in results.items()]
+    rows = [(*key, *map(found.get, COLUMNS), found.get("failed", "")) for key, found in results.items()]
     measured = (
         "200 steps of spheres in a bowl, 30 of boxes, 100 of knots; each row is a process on one thread, in processor "
         "time."

@@ -361,10 +361,10 @@ def record(name: str, thing: Thing, tried: dict[str, Tried], truths: list[Motion
 
 @one_thread()
 def cube(tosses: Path, *, out: Out) -> None:
-    """Fit and test every engine on tosses of a cube; write the record, the identified scenes, and pictures."""
+    """Fit and test every engine on tosses of a cube; write the record, the identified scenes, and a picture."""
     tried, truths, dt = compared(A_CUBE, ENGINES, tosses, out, {FEWER: FEW, OURS: FIT})
     record("reality", A_CUBE, tried, truths, ["position, % of the side", "rotation, degrees"])
-    pictures(tried, truths[1], dt, out)
+    picture(tried, truths[1], dt, out)
 
 
 @one_thread()
@@ -374,15 +374,8 @@ def elbow(tosses: Path, *, out: Out) -> None:
     record("elbow", AN_ELBOW, tried, truths, ["position, % of a link", "rotation, degrees", "hinge, degrees"])
 
 
-def pictures(tried: dict[str, Tried], truth: Motion, dt: float, out: Path) -> None:
-    time, way, turn = (dt * np.arange(1, FRAMES + 1)).tolist(), [], []
-    for name, one in tried.items():
-        off, angle = (part[..., 0] for part in apart(one.judged, truth))
-        way.append(Line(name, time, (100.0 * np.median(off / SIDE, 0)).tolist()))
-        turn.append(Line(name, time, np.degrees(np.median(angle, 0)).tolist()))
-    draw(
-        [Panel("median of 100 tosses", "s", "% of the side", way), Panel("", "s", "degrees", turn)], out / "reality.png"
-    )
+def picture(tried: dict[str, Tried], truth: Motion, dt: float, out: Path) -> None:
+    time = (dt * np.arange(1, FRAMES + 1)).tolist()
     typical = int(np.argsort(errors(tried[OURS].judged, truth, SIDE)[0])[TEST // 2])
     seen = {"recorded": truth, **{name: one.judged for name, one in tried.items()}}
     place = {name: motion.position[typical, :, 0] for name, motion in seen.items()}

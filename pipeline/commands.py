@@ -1,7 +1,5 @@
 """The commands that start from photos or meshes: reconstruct, its stages, measure, joint, and fit."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from pathlib import Path

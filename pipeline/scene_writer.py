@@ -1,7 +1,5 @@
 """Meshes -> a scene: Shape folders with compact SDFs, the scene.yaml, and a place to drop a body onto it."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import shutil
@@ -261,7 +259,7 @@ def bodies_of(scene: Scene, materials: dict[str, Choice]) -> dict[str, BodyRepor
     return found
 
 
-def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: Slab | None, *, scenery: bool = True,
+def scene_text(placement: Placement, origins: dict[str, np.ndarray], slab: "Slab | None", *, scenery: bool = True,
                around: bool = False, drop: str = "box", materials: dict[str, Choice] | None = None,
                seed: int = 0, floor: float = 0.0,
                held: HeldPart | None = None, holder: str | None = None,

@@ -1,7 +1,5 @@
 """The stages from photos to a scene: each in its own folder, skipped when nothing changed, resumed when killed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -31,7 +29,7 @@ FIT_SHARE, AFTER_TRAINING = 0.15, 50.0
 class Instead:
     """Replaces a stage's own work, with the further inputs on which its result depends."""
 
-    run: Callable[[Project, Path], Any]
+    run: Callable[["Project", Path], Any]
     depends: Any
 
 

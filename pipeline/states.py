@@ -10,8 +10,6 @@ Folders: `first` and `second` hold a reconstruction of each state up to its mesh
 reconstruction of one of them, with the joint.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import shutil

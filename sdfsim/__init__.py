@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from sdfsim.apps.film.film import track
     from sdfsim.apps.fit import fit
     from sdfsim.apps.play import play, show
+    from sdfsim.apps.play.saved import save_run
     from sdfsim.apps.render import render
     from sdfsim.apps.run import simulate
-    from sdfsim.apps.save_run import save_run
     from sdfsim.base.errors import SceneError, SdfsimError
     from sdfsim.evaluation.instruments import judged
     from sdfsim.physics.bodies import State
@@ -87,7 +87,7 @@ _HOME = {
     "show": "sdfsim.apps.play",
     "reconstruct": "pipeline.states",
     "render": "sdfsim.apps.render",
-    "save_run": "sdfsim.apps.save_run",
+    "save_run": "sdfsim.apps.play.saved",
     "simulate": "sdfsim.apps.run",
     "track": "sdfsim.apps.film.film",
 }

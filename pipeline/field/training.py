@@ -31,9 +31,7 @@ from pipeline.field.supervision import (
 from pipeline.inputs.images import BACKDROP
 from pipeline.inputs.photos import load_photos, open_mask, open_photo
 from pipeline.stereo.depth import only, outside_mask, stereo, stereo_summary
-from pipeline.stereo.far import save as save_far
-from pipeline.stereo.far import surrounding_distance
-from pipeline.stereo.fusion import Fused, fuse
+from pipeline.stereo.fusion import Fused, fuse, save_far, surrounding_distance
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import write_bytes, write_json
 from sdfsim.base.parallel import Progress, choose_threads, share_of, silent

@@ -3,8 +3,6 @@
 Everything here is in normalised space; heights are measured along a plane's normal.
 """
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, field, replace
 from functools import partial

@@ -5,8 +5,6 @@ bodies, first by distance along the surface, which grooves and changes of colour
 photos (GrabCut, Rother et al. 2004).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -34,7 +34,7 @@ from pipeline.mesh.trust import Evidence, color_range, colors_of, evidence_of, n
 from pipeline.mesh.visibility import Visibility, to_bytes
 from pipeline.options import Options
 from pipeline.records import MeshReport
-from pipeline.stereo.far import load as load_far
+from pipeline.stereo.fusion import load_far
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_json, write_bytes, write_json
 from sdfsim.base.parallel import Progress, share_of, silent

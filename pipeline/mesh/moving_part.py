@@ -1,8 +1,6 @@
 """Evidence from photos of an object in two states on the part that moves: where photos see through, which features look
 alike, and which pixels show the part."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,7 +45,7 @@ class State:
     middle: np.ndarray  # [3] of the ball in which the field was trained
     radius: float
 
-    def moved(self, move: Similarity) -> State:
+    def moved(self, move: Similarity) -> "State":
         """The same in another frame."""
         visible, closed = (Mesh(move.points(mesh.vertices), mesh.faces) for mesh in (self.visible, self.closed))
         views = [move.view(view) for view in self.views]

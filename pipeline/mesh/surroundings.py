@@ -15,7 +15,7 @@ from pipeline.mesh.extraction import RIM, Volume, islands, keep_faces, trusted_v
 from pipeline.mesh.placement import LEVEL_NORMAL
 from pipeline.mesh.trust import FEW
 from pipeline.mesh.visibility import Visibility, look, spread_colors, to_bytes
-from pipeline.stereo.far import Far
+from pipeline.stereo.fusion import Far
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, joined, vertex_normals
 

@@ -7,8 +7,6 @@ Wegbreit, Shape from symmetry, 2005, search for symmetries of scans in the same 
 Everything here is in the space of the mesh that is given.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -90,7 +88,7 @@ class Known:
         self.normals, self.smooth = vertex_normals(mesh), smooth_normals(mesh, mean_of_neighbours(mesh))
         self.finer = FINER
 
-    def rougher(self) -> Known:
+    def rougher(self) -> "Known":
         """The same, to be sampled at places twice as far apart, in an eighth of the time."""
         other = copy(self)
         other.finer = 2 * self.finer

@@ -6,8 +6,6 @@ behind is tried too, because windows mix the surfaces in front of and behind an 
 agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

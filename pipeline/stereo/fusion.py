@@ -4,21 +4,21 @@ A place that no photo sees takes the sign of the nearest place that one does: th
 air beyond a picture's edge is empty.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from pipeline.cameras import Similarity
 from pipeline.grids.connected import largest
 from pipeline.grids.interpolation import near_bricks, places_of
 from pipeline.inputs.images import stacked
 from pipeline.stereo.compiled import carve, paint
 from pipeline.stereo.depth import DepthMap, straightened
+from sdfsim.base.files import read_arrays, write_arrays
 from sdfsim.base.parallel import Progress, silent, threads
 
 BACK = 2.0  # cells in front of and behind a surface within which its distance counts
@@ -35,6 +35,14 @@ SEEN = 0.3  # weight above which a place is known; one certain pixel has 1. Set 
 EDGE = 0.05  # largest relative difference of inverse depth between neighbouring pixels on one surface; by hand
 LEAST_TILT = 0.15  # cosine of the flattest angle that counts; by hand
 BATCH = 1 << 18  # places per batch
+# The field describes the unit sphere only. Photos also show the floor, the walls and the furniture around it. Their
+# depth gives a coarse signed distance there, whose cells are as wide as a hundredth of the room.
+AROUND = "surroundings.npz"  # in the folder of the field: the signed distance
+FAR_SIDE = 96  # samples a side
+FARTHEST = 10.0  # radii of the ball: what is farther away is not solid enough to be met
+WITHIN = 0.98  # of the places outside of the ball lie within the sampled cube
+OUTSIDE = 0.02  # share of the photos' depth that lies outside: with less there is nothing to show
+MARGIN = 1.02  # of the cube beyond them
 
 
 @dataclass(frozen=True)
@@ -67,11 +75,6 @@ def fuse(
     fine = np.clip(share * (value - start), -cell, cell)
     color = _painted(maps, given, place, coarse, start + fine, cell, photos_folder)
     return Fused(coarse, 2 * side - 1, bricks, fine.astype(np.float32), color)
-
-
-def coarse_distance(maps: Sequence[DepthMap], side: int, on_progress: Progress = silent) -> np.ndarray | None:
-    """The signed distance [side, side, side] (z, y, x) on [-1, 1]^3 alone; None if the maps show no surface there."""
-    return _coarse(_prepared(maps), _surface(maps), side, on_progress)
 
 
 def _coarse(given: tuple[np.ndarray, ...], surface: tuple[KDTree, np.ndarray], side: int, on_progress: Progress
@@ -212,3 +215,44 @@ def _distance(solid: np.ndarray, value: np.ndarray, cell: float) -> np.ndarray:
     rough = np.where(solid, 0.5 - inside, outside - 0.5) * cell
     good = np.isfinite(value) & (np.abs(rough) < 1.5 * cell)
     return np.where(good, np.clip(np.nan_to_num(value), rough - cell, rough + cell), rough).astype(np.float32)
+
+
+# --- what lies outside of the trained ball ---
+
+
+@dataclass(frozen=True)
+class Far:
+    """Samples of the signed distance around the ball."""
+
+    values: np.ndarray  # [FAR_SIDE, FAR_SIDE, FAR_SIDE] float32 (x, y, z)
+    reach: float  # of the cube of the samples, to each side of the middle
+
+
+def surrounding_distance(maps: Sequence[DepthMap], on_progress: Progress = silent) -> Far | None:
+    """The signed distance outside of the ball, within the cube that holds nearly all that photos show there; None if
+    they show hardly anything there."""
+    away = np.linalg.norm(np.concatenate([one.points() for one in maps]), axis=1)
+    if not len(away) or (away > 1).mean() < OUTSIDE:
+        return None
+    reach = min(float(np.quantile(away[away > 1], WITHIN)), FARTHEST) * MARGIN
+    shrink = Similarity(1 / reach, np.eye(3), np.zeros(3))
+    # The same photos of a smaller world, which fits into the unit sphere.
+    small = [replace(one, view=shrink.view(one.view), inverse=one.inverse * np.float32(reach)) for one in maps]
+    coarse = _coarse(_prepared(small), _surface(small), FAR_SIDE, on_progress)
+    if coarse is None:
+        return None
+    return Far(reach * coarse.transpose(2, 1, 0), reach)
+
+
+def save_far(far: Far, folder: Path) -> None:
+    """Writes it to the folder of a field."""
+    arrays = {"values": far.values.astype(np.float16), "reach": np.array(far.reach)}
+    write_arrays(folder / AROUND, arrays)
+
+
+def load_far(folder: Path) -> Far | None:
+    """The signed distance that the training has left; None if photos show nothing outside of the ball."""
+    if not (folder / AROUND).exists():
+        return None
+    kept = read_arrays(folder / AROUND, "surroundings", "run the distill stage again")
+    return Far(kept["values"].astype(np.float32), float(kept["reach"]))

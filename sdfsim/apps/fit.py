@@ -8,10 +8,9 @@ from typing import Any, Literal
 
 from sdfsim.base.console import duration
 from sdfsim.base.devices import pick_device
-from sdfsim.base.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError, warn_once
 from sdfsim.base.files import check_writable, locked, read_json, visible
 from sdfsim.base.parallel import Progress, parallel, silent
-from sdfsim.base.warned import warn_once
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES, load_textured
 from sdfsim.scene.schema import UNITS
 from sdfsim.sdf.baked_grid import baked, grid_certificate, unseen_wall

@@ -151,10 +151,8 @@ class _Reader:
                 getattr(model, name)[:] = 0
         if "gravity" in self.off:
             model.opt.gravity[:] = 0.0
-        if done:
-            self.notes.append(named("the file switches off", [flag.split()[0] for flag in done]))
-        if others := [flag for flag in said if flag not in done]:
-            self.left.append(named("flags of MuJoCo", others))
+        self.notes += named("the file switches off", [flag.split()[0] for flag in done])
+        self.left += named("flags of MuJoCo", [flag for flag in said if flag not in done])
 
     def _within_limits(self) -> None:
         model, types = self.model, self.mj.mjtJoint
@@ -173,13 +171,11 @@ class _Reader:
                 self.left.append(f"{what} ({count})")
         roots = [b for b in range(1, model.nbody) if model.body_weldid[b] == 0 and model.body_mocapid[b] < 0]
         held = [b for b in roots if any(p == b and model.body_weldid[c] for c, p in enumerate(model.body_parentid))]
-        if held:
-            message = "bodies without a joint to the world stand still, and hold others (<freejoint/> lets them go)"
-            self.notes.append(named(message, [self._body_name(b) for b in held]))
+        message = "bodies without a joint to the world stand still, and hold others (<freejoint/> lets them go)"
+        self.notes += named(message, [self._body_name(b) for b in held])
         if model.opt.density or model.opt.viscosity or np.any(model.opt.wind):
             self.left.append("air: density, viscosity and wind")
-        if np.any(model.body_gravcomp):
-            self.left.append(named("gravcomp of bodies", self._names(model.body, np.flatnonzero(model.body_gravcomp))))
+        self.left += named("gravcomp of bodies", self._names(model.body, np.flatnonzero(model.body_gravcomp)))
         links: list[Link] = []
         geoms: list[list[int]] = []  # geoms with which each link touches others
         self.link: list[int] = []  # the first link of every body; -1 for the world, and if there is none
@@ -194,8 +190,7 @@ class _Reader:
         joints = [replace(joint, motor=motors.get(joint.name)) for joint in joints]
         free = model.jnt_type[model.dof_jntid] == int(self.mj.mjtJoint.mjJNT_FREE)
         rotors = sorted({int(model.dof_jntid[dof]) for dof in np.flatnonzero(free & (model.dof_armature > 0.0))})
-        if rotors:
-            self.left.append(named("armature of free joints", list(map(self._joint_name, rotors))))
+        self.left += named("armature of free joints", list(map(self._joint_name, rotors)))
         joints += [*self._loops(), *self._ropes()]
         apart = self._apart(geoms)
         meets = self.off.isdisjoint(("contact", "constraint"))
@@ -239,8 +234,7 @@ class _Reader:
                     parent = model.body_parentid[b]
                     there = Rotation.from_matrix(np.stack([d.xmat[parent].reshape(3, 3) for d in (start, data)]))
                     turn = there[0] * there[1].inv() * turns[1] * turns[0].inv()
-                    axis = turns[0].as_matrix()[:, 0] if model.jnt_limited[j] else None
-                    axes = joint_axes(axis)
+                    axes = joint_axes(turns[0].as_matrix()[:, 0] if model.jnt_limited[j] else None)
                     joints[name] = (axes.inv() * turn * axes).as_quat()
                     spin = turns[1].apply(moves[:3])
                     speeds |= {name: (there[1] * there[0].inv() * axes).inv().apply(spin)} if np.any(spin) else {}
@@ -294,8 +288,7 @@ class _Reader:
         """Name every field of the model that says something and is not used. Geoms count that touch others: `solid`."""
         model, mj = self.model, self.mj
         plain = mj.MjModel.from_xml_string(PLAIN)
-        if options := settings(model, plain):
-            self.left.append(named("options of MuJoCo's step", options))
+        self.left += named("options of MuJoCo's step", settings(model, plain))
         if str(model.vis) != str(plain.vis):
             self.left.append("settings of MuJoCo's viewer")
         free = [j for j in range(model.njnt) if model.jnt_type[j] == mj.mjtJoint.mjJNT_FREE]
@@ -304,10 +297,9 @@ class _Reader:
             j for j in free if model.jnt_stiffness[j]
             or any(np.any(getattr(model, name, np.zeros(model.nv))[model.jnt_dofadr[j] :][:6]) for name in drag)
         ]  # fmt: skip
-        if held:
-            self.left.append(named("damping, stiffness and friction of free joints", list(map(self._joint_name, held))))
-        if rolls := [g for g in solid if model.geom_condim[g] > 3]:
-            self.left.append(named("friction against spinning and rolling", self._names(model.geom, rolls)))
+        self.left += named("damping, stiffness and friction of free joints", list(map(self._joint_name, held)))
+        rolls = [g for g in solid if model.geom_condim[g] > 3]
+        self.left += named("friction against spinning and rolling", self._names(model.geom, rolls))
         found: dict[str, dict[str, None]] = {}
         for element, line, rows in unused(model, plain):
             rows = [int(k) for k in rows if element != "geom" or k in solid]
@@ -319,7 +311,8 @@ class _Reader:
                 names = self._names(known, rows) if callable(known) else [f"number {k}" for k in rows]
             if names or not element:
                 found.setdefault(line, {}).update(dict.fromkeys(names))
-        self.left += [named(line, list(names)) if names else line for line, names in found.items()]
+        for line, names in found.items():
+            self.left += named(line, list(names)) or [line]
 
     def _slippery(self, links: list[Link], geoms: list[list[int]], apart: frozenset[tuple[int, int]]) -> list[Link]:
         """The links, without friction if none of their contacts in MuJoCo has any (condim 1). A note says where the
@@ -584,13 +577,10 @@ class _Reader:
             else:
                 speed, *self.keyed[name] = (wanted / (-bias[2] * gear)).tolist()
                 found[name] = {"speed": speed, "max_force": most, "gain": float(-bias[2] * gear**2)}
-        if idle:
-            self.notes.append(named("motors do nothing until an effort or a target of their joint is set", idle))
-        if freely:
-            self.notes.append(named(f"actuators without a force limit get one of {UNBOUNDED:g}", freely))
-        if others:
-            what = "actuators other than motor, position and velocity of a hinge, slide or a tendon that moves one"
-            self.left.append(named(what, others))
+        self.notes += named("motors do nothing until an effort or a target of their joint is set", idle)
+        self.notes += named(f"actuators without a force limit get one of {UNBOUNDED:g}", freely)
+        what = "actuators other than motor, position and velocity of a hinge, slide or a tendon that moves one"
+        self.left += named(what, others)
         return found
 
     def _loops(self) -> list[LinkJoint]:
@@ -623,10 +613,8 @@ class _Reader:
                 self.notes.append(f"equality {name}: its ends are apart at the start; it keeps them at that distance")
             child, parent = both if both[0] >= 0 else both[::-1]
             found.append(LinkJoint(name, "ball" if ball else "fixed", child, parent, places[0], loop=True))
-        if others:
-            self.left.append(named("equalities other than connect or weld of two bodies", others))
-        if idle:
-            self.left.append(named("equalities that are switched off", idle))
+        self.left += named("equalities other than connect or weld of two bodies", others)
+        self.left += named("equalities that are switched off", idle)
         return found
 
     def _ropes(self) -> list[LinkJoint]:
@@ -669,8 +657,7 @@ class _Reader:
                     spring=(stiff, float(model.tendon_lengthspring[k, 1])) if stiff and k not in rods else None,
                 )
             )  # fmt: skip
-        if others:
-            self.left.append(named("tendons other than a rope, rod or spring between two sites", others))
+        self.left += named("tendons other than a rope, rod or spring between two sites", others)
         return found
 
 

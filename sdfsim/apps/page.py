@@ -1,7 +1,5 @@
 """A scene on a page in the browser, by viser: live, or a run in one file that needs no server."""
 
-from __future__ import annotations
-
 import io
 import threading
 import time

@@ -14,6 +14,7 @@ from sdfsim.apps.beside import COLOR, OPACITY, between, rows_in
 from sdfsim.base.files import write_bytes
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.physics import pose
+from sdfsim.physics.bodies import largest_extent
 from sdfsim.physics.motion import MOTION
 from sdfsim.physics.rollout import Rollout
 from sdfsim.physics.steps import PHASES
@@ -22,10 +23,12 @@ from sdfsim.scene.scene import Joint, Scene
 from sdfsim.simulate.camera import Camera, eye_around
 from sdfsim.simulate.looks import body_colors, framed, shown, with_normals
 
-if TYPE_CHECKING:  # these are slow to load
+if TYPE_CHECKING:
     import rerun as rr
     import rerun.blueprint as rrb
     from PIL import Image
+else:
+    from sdfsim.base.lazy import rr, rrb
 
 WORLD = "world"
 CONTACTS = "world/contacts"
@@ -70,9 +73,6 @@ class Playback:
     def __init__(
         self, scene: Scene, motion: Rollout | None = None, *, network: bool = True, beside: Rollout | None = None
     ) -> None:
-        import rerun as rr
-
-        self._rr = rr
         self._scene = scene
         self._centre, self._radius = framed(scene, motion)
         self._step = 0
@@ -100,8 +100,6 @@ class Playback:
     def blueprint(self) -> rrb.Blueprint:
         """The layout: the scene on the left, plots of the counters on the right. Nodes, contact points, forces and the
         marks of bodies at rest are hidden until a user switches them on."""
-        import rerun.blueprint as rrb
-
         hidden = [CONTACTS, FORCES, STILL, *(f"{path}/nodes" for _, path in self._alone)]
         view = rrb.Spatial3DView(
             origin=WORLD,
@@ -124,14 +122,14 @@ class Playback:
 
     def log_static(self) -> None:
         """Log everything that does not change: meshes, surface nodes, and the names of the plots."""
-        rr, scene = self._rr, self._scene
+        scene = self._scene
         self.stream.send_blueprint(self.blueprint())
         self.stream.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         colors = body_colors(scene)
         for crowd in self._crowds:
             shape = scene.shapes[crowd.shape]
             mesh = replace(shape.shown, vertices=shape.shown.vertices - shape.com)
-            self.stream.log(crowd.path, _shaded(rr, mesh, colors[crowd.bodies[0]]), static=True)
+            self.stream.log(crowd.path, _shaded(mesh, colors[crowd.bodies[0]]), static=True)
             scales = np.repeat([[scene.bodies[k].scale] for k in crowd.bodies], 3, 1)
             self.stream.log(crowd.path, rr.InstancePoses3D.from_fields(scales=scales), static=True)
         for k, path in self._alone:
@@ -139,7 +137,7 @@ class Playback:
             shape = scene.shapes[body.shape]
             mesh = shown(scene, k, 6 * self._radius)
             placed = replace(mesh, vertices=mesh.vertices * body.scale - com)
-            self.stream.log(f"{path}/mesh", _shaded(rr, placed, colors[k]), static=True)
+            self.stream.log(f"{path}/mesh", _shaded(placed, colors[k]), static=True)
             if len(shape.nodes):
                 nodes = rr.Points3D(shape.nodes * body.scale - com, colors=_NODE_COLOR, radii=rr.Radius.ui_points(2))
                 self.stream.log(f"{path}/nodes", nodes, static=True)
@@ -150,7 +148,7 @@ class Playback:
         for k, path in self._ghosts:
             body, mesh = scene.bodies[k], scene.shapes[scene.bodies[k].shape].mesh
             plain = Mesh(mesh.vertices * body.scale - self._com[k], mesh.faces)
-            self.stream.log(f"{path}/mesh", _shaded(rr, plain, (*COLOR, round(255 * OPACITY))), static=True)
+            self.stream.log(f"{path}/mesh", _shaded(plain, (*COLOR, round(255 * OPACITY))), static=True)
         for joint in shown_joints(scene):
             for number, mark in enumerate(marks(scene, joint)):
                 home = JOINTS if mark.body < 0 else dict(self._alone)[mark.body]
@@ -172,7 +170,7 @@ class Playback:
     def log_steps(self, chunk: Rollout) -> None:
         """Log poses, contact points, forces, marks of bodies at rest, and counters of the frames of `chunk`, which
         follow the frames logged before."""
-        rr, frames = self._rr, len(chunk.time)
+        frames = len(chunk.time)
         steps = np.arange(self._step, self._step + frames)
         self._step += frames
         times = [rr.TimeColumn("time", duration=chunk.time), rr.TimeColumn("step", sequence=steps)]
@@ -209,7 +207,7 @@ class Playback:
         gravity), as an arrow at the body's centre. An arrow as long as its body is the body's weight (on Earth, in a
         scene without gravity); arrows are at most `LONGEST` bodies long. Also log a point on each body that has not
         moved since then."""
-        rr, rows = self._rr, self._movers
+        rows = self._movers
         ahead = self._before
         parts = [chunk] if ahead is None else [ahead, chunk]
         time, place, turn, speed, spin = (
@@ -244,8 +242,6 @@ class Crowd(NamedTuple):
 
 def _crowds(scene: Scene) -> list[Crowd]:
     """The crowds of a scene. Other bodies are drawn one by one, and so are those whose joints are shown."""
-    import rerun as rr
-
     found = []
     shape = np.array([b.shape if b.motion != "static" else -1 for b in scene.bodies])
     shape[[k for joint in shown_joints(scene) for k in joint.bodies if k >= 0]] = -1
@@ -290,9 +286,6 @@ def save_reconstruction(
     Parts with textures (`skins`, by name) are shown in place of the mesh. With `trust` (parts whose colours show how
     far each place can be trusted) the viewer has a second tab for these.
     """
-    import rerun as rr
-    import rerun.blueprint as rrb
-
     stream = rr.RecordingStream("sdfsim-reconstruct")
     encoded = stream.binary_stream()
     centres = np.array([photo.camera.position for photo in photos])
@@ -322,7 +315,7 @@ def save_reconstruction(
         surfaces = {f"{WORLD}/surface/{rr.escape_entity_path_part(name)}": skin for name, skin in skins.items()}
     surfaces |= {f"{WORLD}/trust/{rr.escape_entity_path_part(name)}": part for name, part in trust.items()}
     for entity, surface in surfaces.items():
-        stream.log(entity, _shaded(rr, surface, (200, 190, 175)), static=True)
+        stream.log(entity, _shaded(surface, (200, 190, 175)), static=True)
     for photo in photos:
         camera = photo.camera
         entity = f"{WORLD}/cameras/{rr.escape_entity_path_part(photo.name)}"
@@ -345,12 +338,10 @@ def save_reconstruction(
 
 
 def _controls(eye: Camera) -> rrb.EyeControls3D:
-    import rerun.blueprint as rrb
-
     return rrb.EyeControls3D(kind=rrb.Eye3DKind.Orbital, position=eye.position, look_target=eye.look_at, eye_up=eye.up)
 
 
-def _shaded(rr: Any, mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
+def _shaded(mesh: Mesh, color: tuple[int, ...]) -> rr.Mesh3D:
     """The mesh with its own texture or colours, or with `color` if it has neither."""
     from PIL import Image
 
@@ -449,5 +440,4 @@ def _extent(scene: Scene, k: int) -> float:
     """Extent of a body, m; infinite for the world and for planes."""
     if k < 0:
         return np.inf
-    box = np.ptp(scene.shapes[scene.bodies[k].shape].sdf.bounds, axis=0).max() * scene.bodies[k].scale
-    return float(box)
+    return largest_extent(scene.shapes[scene.bodies[k].shape]) * scene.bodies[k].scale

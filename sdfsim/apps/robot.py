@@ -98,10 +98,10 @@ class Robot:
     couplings: tuple[tuple[str, str, float, float], ...] = ()  # first joint = number x second + number, rad or m
 
 
-def named(what: str, names: Sequence[str]) -> str:
-    """`what (3: a, b, c)`, for a line of the report."""
+def named(what: str, names: Sequence[str]) -> list[str]:
+    """A line of the report: `what (3: a, b, c)`. None if there are no names."""
     more = ", ..." if len(names) > MOST_NAMED else ""
-    return f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"
+    return [f"{what} ({len(names)}: {', '.join(names[:MOST_NAMED])}{more})"] * bool(names)
 
 
 # --- to a scene ---
@@ -352,9 +352,8 @@ def _apart(robot: Robot) -> tuple[Robot, list[str]]:
                 joints.append(replace(joint, child=len(links) - 1, parent=before))
                 before = len(links) - 1
         joints.append(replace(chain[-1], child=child, parent=before))
-    if split:
-        part = f"{100 * SMALL_PART:g} % of their mass"
-        notes.append(named(f"links with several joints: a small ball between two of these has {part}", split))
+    part = f"{100 * SMALL_PART:g} % of their mass"
+    notes += named(f"links with several joints: a small ball between two of these has {part}", split)
     return replace(robot, links=tuple(links), joints=tuple(joints)), notes
 
 
@@ -487,8 +486,7 @@ def _avoided(
             elif _overlap(shapes[a], poses[a], shapes[b], poses[b]):
                 denied.add((a, b))
                 overlapping.append(f"{links[a].name} and {links[b].name}")
-    if overlapping:
-        notes.append(named("links that overlap at the start will not touch each other", overlapping))
+    notes += named("links that overlap at the start will not touch each other", overlapping)
     found: list[list[str] | None] = [[] if alone else None for alone in bare]
     for k in (k for k in range(count) if not bare[k]):
         # Without those that a joint already keeps from touching.

@@ -21,9 +21,8 @@ from sdfsim.evaluation.engines import Engine, Ran, TooSlow, bullet, by_engine, b
 from sdfsim.evaluation.harness import Job, Line, Panel, Results, draw, markdown, measure
 from sdfsim.evaluation.instruments import judged
 from sdfsim.evaluation.laws import everyday, hard_cases, joints, scenes, textbook
-from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.hard_cases import ran_away
-from sdfsim.evaluation.laws.scenes import Law
+from sdfsim.evaluation.laws.scenes import Check, Law
 from sdfsim.evaluation.laws.table import GROUPS, laws, settings
 from sdfsim.learned.model import SOLVER, Model, load_model
 from sdfsim.scene.scene import Scene

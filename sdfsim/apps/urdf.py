@@ -44,6 +44,7 @@ GEOMETRIES = ("box", "sphere", "cylinder", "capsule", "mesh", "plane")
 _ORIGIN = (0.0, 0.0, 0.0)
 _ROOT = ("link", "joint", "material")
 _OF_LINK = ("inertial", "visual", "collision", "contact")
+_OF_PART = ("geometry", "origin", "material")
 _OF_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic")
 _OF_CONTACT = ("lateral_friction", "restitution")
 
@@ -206,9 +207,7 @@ class _Reader:
     # --- the robot ---
 
     def robot(self, fixed: bool) -> Robot:
-        for element in self.root:
-            if element.tag not in _ROOT:
-                self.left[f"<{element.tag}>"] += 1
+        self.left.update(f"<{element.tag}>" for element in self.root if element.tag not in _ROOT)
         colors = {e.get("name", ""): self._rgb(e) for e in self.root.findall("material")}
         elements = self._by_name("link", self.root.findall("link"))
         if not elements:
@@ -287,9 +286,7 @@ class _Reader:
         return red, green, blue
 
     def _link(self, name: str, element: Element, colors: dict[str, Any]) -> Link:
-        for child in element:
-            if child.tag not in _OF_LINK:
-                self.left[f"<{child.tag}> of links"] += 1
+        self.left.update(f"<{child.tag}> of links" for child in element if child.tag not in _OF_LINK)
         parts: dict[str, list[Part]] = {"visual": [], "collision": []}
         for tag, found in parts.items():
             for child in element.findall(tag):
@@ -297,9 +294,7 @@ class _Reader:
                 color = self._rgb(material)
                 if color is None and material is not None:
                     color = colors.get(material.get("name", ""))
-                for other in child:
-                    if other.tag not in ("geometry", "origin", "material"):
-                        self.left[f"<{other.tag}> of {tag}s"] += 1
+                self.left.update(f"<{other.tag}> of {tag}s" for other in child if other.tag not in _OF_PART)
                 part = self._part(child, color, needed=tag == "collision")
                 found += [part] if part else []
         mass, com, inertia = 0.0, np.zeros(3), None
@@ -412,9 +407,7 @@ class _Reader:
         name, kind = self.text(element, "name"), self.text(element, "type")
         if kind not in KINDS:
             raise self.wrong(element, f"type must be one of {', '.join(KINDS)} (got {kind!r}{nearest(kind, KINDS)})")
-        for other in element:
-            if other.tag not in _OF_JOINT:
-                self.left[f"<{other.tag}> of joints"] += 1
+        self.left.update(f"<{other.tag}> of joints" for other in element if other.tag not in _OF_JOINT)
         pose = links[parent].pose @ self.origin(element)
         anchor, turn = pose[:3, 3], pose[:3, :3]
         axis = self.child(element, "axis")

@@ -32,7 +32,7 @@ def stream_to_viewer(playback: Playback, kind: str) -> str:
     if not _started(viewer, port) or (kind == "web" and not _started(viewer, page_port)):
         _end(viewer)
         raise SdfsimError("the rerun viewer does not start", "use --viewer file")
-    playback.stream.connect_grpc(_address(port))
+    playback.stream.connect_grpc(f"rerun+http://{LOOPBACK}:{port}/proxy")
     if kind == "native":
         return ""
     atexit.register(_end, viewer)
@@ -50,10 +50,6 @@ def _started(viewer: subprocess.Popen, port: int) -> bool:
             return False
         time.sleep(0.1)
     return True
-
-
-def _address(port: int) -> str:
-    return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
 def _page(page_port: int, port: int) -> str:

@@ -9,6 +9,8 @@ from sdfsim.base.errors import SdfsimError
 
 if TYPE_CHECKING:
     import torch
+else:
+    from sdfsim.base.lazy import torch  # it takes its time to load
 
 
 def check_device(name: str) -> None:
@@ -20,8 +22,6 @@ def check_device(name: str) -> None:
 
 def pick_device(name: str) -> torch.device:
     """A device: "auto", "cpu", "cuda" or "cuda:0". Raises SdfsimError for another name, or if there is no CUDA."""
-    import torch  # it takes its time to load
-
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if not re.fullmatch(r"cpu|cuda(:\d+)?", name, re.ASCII):

@@ -1,9 +1,12 @@
-"""The error types of the project; commands and `run_main` turn them into one line, a hint and an exit code."""
+"""The error types of the project; commands and `run_main` turn them into one line, a hint and an exit code. And
+warnings for callers from Python, in place of the lines that a command prints."""
 
 import difflib
 import itertools
+import logging
 import sys
 from collections.abc import Callable, Iterable
+from functools import cache
 
 EXIT_ERROR = 1
 EXIT_USAGE = 2
@@ -20,6 +23,12 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """` (did you mean 'x'?)` with the nearest known name, or an empty string."""
     match = difflib.get_close_matches(name[:100], itertools.islice(known, 1000), n=1, cutoff=0.55)
     return f" (did you mean '{match[0]}'?)" if match else ""
+
+
+@cache
+def warn_once(line: str) -> None:
+    """Warn, unless this process has given the same warning before: scenes are loaded again and again."""
+    logging.getLogger(__name__).warning("%s", line)
 
 
 class SdfsimError(Exception):

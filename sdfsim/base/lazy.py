@@ -1,20 +1,29 @@
-"""Packages that are imported on first use: torch, which simulations with the contact solve alone never need, and the
-packages of extras."""
+"""What is imported or made on first use: torch, which simulations with the contact solve alone never need, rerun, the
+packages of extras, and what belongs to an object."""
 
 import importlib
-from typing import Any
+import weakref
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 from sdfsim.base.errors import SdfsimError
 
+Of = TypeVar("Of")
+Made = TypeVar("Made")
+_MADE: dict[tuple[int, Callable], Any] = {}
 
-class _Torch:
+
+class _Package:
+    def __init__(self, module: str) -> None:
+        self._module = module
+
     def __getattr__(self, name: str) -> Any:
-        found = getattr(importlib.import_module("torch"), name)
+        found = getattr(importlib.import_module(self._module), name)
         setattr(self, name, found)
         return found
 
 
-torch = _Torch()
+torch, rr, rrb = _Package("torch"), _Package("rerun"), _Package("rerun.blueprint")
 
 
 class NotInstalled(SdfsimError):
@@ -39,3 +48,12 @@ def pyplot() -> Any:
     """matplotlib's pyplot, set to draw into files. Raises NotInstalled if matplotlib is missing."""
     optional("matplotlib", "matplotlib", "bench").use("Agg")
     return importlib.import_module("matplotlib.pyplot")
+
+
+def made_once(of: Of, make: Callable[[Of], Made]) -> Made:
+    """What the function `make` makes of an object, at its first call; it is kept as long as the object is."""
+    key = id(of), make
+    if key not in _MADE:
+        _MADE[key] = make(of)
+        weakref.finalize(of, _MADE.pop, key, None)
+    return _MADE[key]

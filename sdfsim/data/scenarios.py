@@ -91,7 +91,10 @@ class Recipe:
 
 def movi_b(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
     """Kubric's `movi_ab_worker`, restated."""
-    return _toss(teacher, rng, cast, lambda source: _of_material(source, rng, SIZES))
+    names = list(MATERIALS)
+    return _toss(
+        teacher, rng, cast, lambda source: _body(source, rng.uniform(*SIZES), *MATERIALS[str(rng.choice(names))])
+    )
 
 
 def movi_c(teacher: Teacher, rng: np.random.Generator, cast: Cast) -> Bodies | None:
@@ -293,10 +296,6 @@ def _find_room(
 def _body(source: ShapeSource, extent: float, density: float, friction: float, restitution: float) -> TeacherBody:
     """A body of a shape at scale `extent`; density 0 makes it static."""
     return TeacherBody(source.urdf, extent, source.volume * density * extent**3, friction, restitution)
-
-
-def _of_material(source: ShapeSource, rng: np.random.Generator, extents: tuple[float, float]) -> TeacherBody:
-    return _body(source, rng.uniform(*extents), *MATERIALS[str(rng.choice(list(MATERIALS)))])
 
 
 def _box(source: ShapeSource, body: TeacherBody, rotation: Rotation) -> tuple[np.ndarray, np.ndarray]:

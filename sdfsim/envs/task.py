@@ -1,7 +1,5 @@
 """A scene as a Gymnasium environment. To make one of your own, copy a class of `tasks.py` and change its words."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """The environments that come with sdfsim. Each is short: read it, copy it, change it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -122,11 +122,6 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.0f}" if abs(value) >= 10**digits else f"{value:.{digits}g}"
 
 
-def why_failed(found: dict[str, Any]) -> str:
-    """Why a result failed; empty if it did not."""
-    return next((found[key] for key in ("failed", "broken") if found.get(key)), "")
-
-
 def front(time: Sequence[float], error: Sequence[float]) -> list[int]:
     """Indices of the Pareto front, by time: no other point is at least as good in time and error, and better in one."""
     kept: list[int] = []

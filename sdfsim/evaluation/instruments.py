@@ -6,13 +6,14 @@ closed forms and meshes.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sdfsim.base.lazy import made_once
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.evaluation.true_surfaces import Gaps, Placed, TrueSurface, gaps, true_surface
 from sdfsim.physics import pose
@@ -323,21 +324,13 @@ def telling_frames(scene: Scene, rollout: Rollout) -> list[int]:
     return found
 
 
-def in_order(count: int) -> Iterator[int]:
+def in_order(count: int) -> list[int]:
     """The numbers of `count` frames, each once: the last, the first, the middle, the quarters, ..."""
-    seen = set()
-    for value in (count - 1, 0):
-        if 0 <= value < count and value not in seen:
-            seen.add(value)
-            yield value
-    step = 1
+    order, step = [count - 1, 0], 1
     while step < count:
         step *= 2
-        for odd in range(1, step, 2):
-            value = (count - 1) * odd // step
-            if value not in seen:
-                seen.add(value)
-                yield value
+        order += [(count - 1) * odd // step for odd in range(1, step, 2)]
+    return list(dict.fromkeys(order)) if count else []
 
 
 @dataclass(frozen=True)
@@ -407,15 +400,7 @@ def _surfaces(
 
 def solid_of(shape: Shape) -> TrueSurface:
     """A shape's exact geometry, made once."""
-    known = _SOLIDS.get(id(shape))
-    if known is None or known[0] is not shape:
-        if len(_SOLIDS) >= 256:
-            _SOLIDS.clear()
-        _SOLIDS[id(shape)] = known = (shape, true_surface(shape))
-    return known[1]
-
-
-_SOLIDS: dict[int, tuple[Shape, TrueSurface]] = {}
+    return made_once(shape, true_surface)
 
 
 def _pushed(scene: Scene, rollout: Rollout, dynamic: np.ndarray) -> np.ndarray:

@@ -29,11 +29,9 @@ from sdfsim.physics.options import SUBSTEPS
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import Scene
 from sdfsim.sdf.closed_forms import ClosedForm
-from sdfsim.sdf.grid import GridSdf, sample_grid
-from sdfsim.sdf.mesh_sdf import MeshSdf
-from sdfsim.sdf.mlp import MlpSdf
+from sdfsim.sdf.grid import sample_grid
 from sdfsim.sdf.reference import MeshDistance, PiecesDistance
-from sdfsim.shape.shape import Shape, own_pieces, with_nodes, with_sdf
+from sdfsim.shape.shape import Shape, centred, own_pieces, with_nodes, with_sdf
 from sdfsim.shape.surface_nodes import hull_nodes
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.simulate.steppers import stepper_of
@@ -125,23 +123,13 @@ def cases_of_scene(scene: Scene, model: str, folder: Path, *, quick: bool) -> Ca
     }
     if start.floor is None or any(problems.values()):
         raise SdfsimError(f"{scene.path}: {next(problem for problem, there in problems.items() if there)}")
-    shapes = {name: _centred(scene.shapes[int(name)], name) for name in start.urdfs}
+    shapes = {name: replace(centred(scene.shapes[int(name)]), name=name) for name in start.urdfs}
     t = start.motion
     # The engine's bodies fly as if their velocities were ahead by half an inner step of gravity.
     lead = 0.5 * SUBSTEP * t.gravity * ~t.static[:, None]
     steps = max(2, min(STEPS_QUICK if quick else STEPS, round(scene.duration / units.time / DT)))
     recorded, _ = bullet(replace(start, motion=replace(t, velocity=t.velocity - lead)), steps)
     return Cases([recorded], [t], shapes, start.urdfs, start.floor, True, units.length, units.time)
-
-
-def _centred(shape: Shape, name: str) -> Shape:
-    sdf, mesh = shape.sdf, replace(shape.mesh, vertices=shape.mesh.vertices - shape.com)
-    if isinstance(sdf, MlpSdf | GridSdf):
-        sdf = replace(sdf, frame=replace(sdf.frame, centre=sdf.frame.centre - shape.com), bounds=sdf.bounds - shape.com)
-    elif isinstance(sdf, MeshSdf):
-        sdf = MeshSdf(replace(sdf.mesh, vertices=sdf.mesh.vertices - shape.com))
-    pieces = tuple(piece - shape.com for piece in shape.pieces)
-    return replace(shape, name=name, mesh=mesh, sdf=sdf, nodes=shape.nodes - shape.com, com=np.zeros(3), pieces=pieces)
 
 
 # --- models and engines ---

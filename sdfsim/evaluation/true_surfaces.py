@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sdfsim.geometry.bvh import Winding
-from sdfsim.geometry.mesh import Mesh, convex_hull
+from sdfsim.geometry.mesh import Mesh, area_vectors, convex_hull, halves
 from sdfsim.geometry.primitives import box
 from sdfsim.sdf.closed_forms import COMMON_FORMS, BoxSdf, CapsuleSdf, ClosedForm, CylinderSdf, PlaneSdf, SphereSdf
 from sdfsim.sdf.reference import PiecesDistance
@@ -27,7 +27,8 @@ FINE = 2e-4  # relative to the smaller thickness: precision of a distance
 ROUGH = 4e-3  # likewise, for a body that is not convex: bounds are weaker there, and there are many triangles
 AROUND = 16  # corners of the circles with which cutting of round surfaces starts
 TURN = 0.05  # largest winding number of a point that is outside everything
-FLAT = 1e-9  # relative to a mesh's size: how far beyond a face's plane a vertex of a convex mesh may be
+FLAT = 1e-7  # relative to a mesh's size: how far beyond a face's plane a vertex of a convex mesh may be
+MOST_CONVEX = 6000  # faces: larger meshes are not tested for this
 
 Distance = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -66,21 +67,19 @@ def true_surface(shape: Shape) -> TrueSurface:
     return of_mesh(shape.mesh)
 
 
+def _same(points: np.ndarray) -> np.ndarray:
+    return points
+
+
 def _closed_form(sdf: ClosedForm) -> TrueSurface:
-    def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return sdf(points)
-
-    def same(points: np.ndarray) -> np.ndarray:
-        return points
-
     bounds = np.asarray(sdf.bounds)
     if isinstance(sdf, PlaneSdf):
         none = np.zeros((0, 3, 3))
-        return TrueSurface(none, np.zeros(0), np.zeros(1, int), np.zeros((0, 4)), bounds, distance, same, True, 1, 0.0)
+        return TrueSurface(none, np.zeros(0), np.zeros(1, int), np.zeros((0, 4)), bounds, sdf, _same, True, 1, 0.0)
     if isinstance(sdf, BoxSdf):
         corners = box(tuple(np.ptp(bounds, axis=0)))
         corner = corners.vertices[corners.faces]
-        return _clustered(corner, np.full(len(corner), np.inf), bounds, distance, same, turns=0)
+        return _clustered(corner, np.full(len(corner), np.inf), bounds, sdf, _same, turns=0)
     turn = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.cos(turn), np.sin(turn)], 1)
     if isinstance(sdf, CylinderSdf):
@@ -105,7 +104,7 @@ def _closed_form(sdf: ClosedForm) -> TrueSurface:
             corner.append(np.stack([ring, np.roll(ring, -1, 0), middle], 1))
             bend.append(np.full(AROUND, -radius))  # flat, with a round rim
     triangles, bent = np.concatenate(corner), np.concatenate(bend)
-    area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+    area = np.linalg.norm(area_vectors(triangles), axis=1)
     kept = area > 1e-12 * radius * radius
 
     def onto(points: np.ndarray) -> np.ndarray:
@@ -119,20 +118,24 @@ def _closed_form(sdf: ClosedForm) -> TrueSurface:
         return axis + away * (radius / np.maximum(length, 1e-300))
 
     turns = 2 if isinstance(sdf, SphereSdf) else 1
-    return _clustered(triangles[kept], bent[kept], bounds, distance, onto, turns=turns, straight=half)
+    return _clustered(triangles[kept], bent[kept], bounds, sdf, onto, turns=turns, straight=half)
 
 
 def of_mesh(mesh: Mesh) -> TrueSurface:
     import igl  # a third of what open3d takes to load, and in double precision
 
-    convex, size = _is_convex(mesh), float(np.ptp(mesh.vertices, axis=0).max())
+    size = float(np.ptp(mesh.vertices, axis=0).max())
     vertices, faces = np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces, dtype=np.int64)
     corner = vertices[faces]
-    across = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    across = area_vectors(corner)
     area = np.linalg.norm(across, axis=1)
     normals = across / np.maximum(area, 1e-300)[:, None]
     planes = normals[area > 1e-12 * size * size]
     offset = (planes * corner[area > 1e-12 * size * size, 0]).sum(1)
+    used = vertices[np.unique(faces)]
+    convex = len(faces) <= MOST_CONVEX and all(
+        (used @ planes[k : k + 256].T - offset[k : k + 256]).max() <= FLAT * size for k in range(0, len(planes), 256)
+    )
     tree, winding = igl.AABB(), Winding(mesh)
     tree.init(vertices, faces)
 
@@ -176,44 +179,14 @@ def _of_pieces(oracle: PiecesDistance) -> TrueSurface:
 def _triangles(mesh: Mesh, distance: Distance, *, convex: bool) -> TrueSurface:
     corner = mesh.vertices[mesh.faces]
     bounds = np.stack([corner.min((0, 1)), corner.max((0, 1))])
-    same = lambda points: points  # noqa: E731
-    return _clustered(corner, np.full(len(corner), np.inf), bounds, distance, same, turns=0, convex=convex)
-
-
-def _is_convex(mesh: Mesh) -> bool:
-    """Whether no vertex lies beyond the plane of a face; used for small meshes only."""
-    corner = mesh.vertices[mesh.faces]
-    if len(corner) > 6000:
-        return False
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    length = np.linalg.norm(normal, axis=1)
-    size = float(np.ptp(mesh.vertices, axis=0).max())
-    real = length > 1e-12 * size * size
-    normal, corner = normal[real] / length[real, None], corner[real]
-    used = mesh.vertices[np.unique(mesh.faces)]
-    off = (normal * corner[:, 0]).sum(1)
-    return all(
-        (used @ normal[k : k + 256].T - off[k : k + 256]).max() <= max(FLAT, 1e-7) * size
-        for k in range(0, len(normal), 256)
-    )
+    return _clustered(corner, np.full(len(corner), np.inf), bounds, distance, _same, turns=0, convex=convex)
 
 
 def _clustered(
     corner: np.ndarray, bend: np.ndarray, bounds: np.ndarray, distance: Distance,
     onto: Callable[[np.ndarray], np.ndarray], *, turns: int, convex: bool = True, straight: float = 0.0,
 ) -> TrueSurface:  # fmt: skip
-    middle = corner.mean(1)
-    parts = [np.arange(len(corner))]
-    while any(len(p) > CLUSTER for p in parts):
-        halves = []
-        for p in parts:
-            if len(p) <= CLUSTER:
-                halves.append(p)
-                continue
-            axis = int(np.argmax(np.ptp(middle[p], axis=0)))
-            order = p[np.argsort(middle[p, axis], kind="stable")]
-            halves += [order[: len(p) // 2], order[len(p) // 2 :]]
-        parts = halves
+    parts = halves(corner.mean(1), CLUSTER)
     order = np.concatenate(parts)
     start = np.concatenate([[0], np.cumsum([len(p) for p in parts])])
     corner, bend = corner[order], bend[order]

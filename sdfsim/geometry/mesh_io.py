@@ -9,12 +9,12 @@ import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.files import visible
-from sdfsim.geometry.collada import collada_surface
 from sdfsim.geometry.gltf import GltfWriter, read_gltf, read_painted
 from sdfsim.geometry.mesh import Mesh, clean, convex_hull, far_middle, require_whole
 from sdfsim.geometry.mesh_formats import (
     FileMesh,
     averaged,
+    collada_surface,
     image_beside,
     looked_up,
     obj_surface,

@@ -1,8 +1,6 @@
 """Encode, process, decode on typed graphs: a network knows a graph by its sets of nodes, and the kinds of edges that
 join them (`Layout`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import cast
@@ -57,7 +55,7 @@ class MultiGraph:
         """Number of edges, counting both directions."""
         return sum(len(edges.sender) for edges in self.edges.values())
 
-    def mirrored(self, layout: Layout) -> MultiGraph:
+    def mirrored(self, layout: Layout) -> "MultiGraph":
         """The graph of the scene's mirror image: y of every vector feature reversed."""
         nodes = {name: flipped(x, layout.nodes[name]) for name, x in self.nodes.items()}
         kinds = layout.edges

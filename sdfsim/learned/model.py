@@ -77,8 +77,8 @@ def new_network(kind: str, config: dict[str, Any]) -> nn.Module:
         return ImpulseNetwork(ImpulseConfig(**config))
     if kind != SURFACES:
         raise KeyError(kind)
-    from sdfsim.learned.graphs import SDF_SIM
     from sdfsim.learned.message_passing import GraphConfig, GraphNetwork
+    from sdfsim.learned.surfaces import SDF_SIM
 
     return GraphNetwork(SDF_SIM, GraphConfig(**config))
 

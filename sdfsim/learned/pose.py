@@ -1,5 +1,5 @@
 """Rotations as unit quaternions (xyzw) in torch, for networks: batched over leading dimensions, in the dtype of the
-input. `sdfsim.physics.pose` is the same in NumPy."""
+input. `sdfsim.physics.pose` is the same in NumPy, and has more."""
 
 import torch
 from torch import Tensor
@@ -18,11 +18,6 @@ def conjugate(q: Tensor) -> Tensor:
     return torch.cat([-q[..., :3], q[..., 3:]], -1)
 
 
-def normalise(q: Tensor) -> Tensor:
-    """The unit quaternion nearest to `q` [..., 4]."""
-    return q / q.norm(dim=-1, keepdim=True)
-
-
 def rotate(q: Tensor, v: Tensor) -> Tensor:
     """Vectors `v` [..., 3] turned by `q` [..., 4]."""
     t = 2.0 * torch.linalg.cross(q[..., :3], v)
@@ -38,14 +33,6 @@ def to_matrix(q: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of unit quaternions [..., 4]."""
     axes = torch.eye(3, dtype=q.dtype, device=q.device).expand(*q.shape[:-1], 3, 3)
     return rotate(q[..., None, :], axes).mT
-
-
-def from_rotvec(r: Tensor) -> Tensor:
-    """Unit quaternions of rotation vectors [..., 3] rad (axis times angle)."""
-    angle = r.norm(dim=-1, keepdim=True)
-    half = 0.5 * angle
-    # torch.sinc is sin(pi x) / (pi x): smooth through zero.
-    return torch.cat([0.5 * torch.sinc(half / torch.pi) * r, half.cos()], -1)
 
 
 def to_rotvec(q: Tensor) -> Tensor:

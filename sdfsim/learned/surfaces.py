@@ -1,27 +1,127 @@
-"""The network on surface nodes: features of nodes and of edges within bodies, targets, and the step to new poses.
+"""SDF-Sim's graph and step, as published (section 3 and appendix): features of nodes and edges, targets, and the step
+to new poses.
+
+Every body has one body node and its surface nodes, joined both ways (up: to the body node). A surface node near another
+body is joined to that body's node both ways. Surface nodes are never joined to each other. A node is near if
+d - (closing speed) dt <= reach: with a fixed threshold a fast body could bounce inside one step without ever having an
+edge.
 
 The network predicts an acceleration for every surface node; shape matching turns those of a body into its next pose.
 """
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sdfsim.learned import pose
-from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, MultiGraph
-from sdfsim.learned.near import Contacts
-from sdfsim.learned.tensors import BodyTensors, StateTensors
+from sdfsim.learned.message_passing import EdgeKind, EdgeSet, Features, GraphNetwork, Layout, MultiGraph
+from sdfsim.physics.bodies import Bodies, State
+from sdfsim.physics.motion import Motion
+from sdfsim.physics.solver.prepare import Compiled, nodes_near
 
 NODE = Features(13, (0, 3, 6))  # features of surface nodes and of body nodes
 INTRA = Features(8, (0, 4))  # features of edges within a body
-NODES = {"body": NODE, "node": NODE}
-STAR = {"intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA)}
+CONTACT = Features(15, (0, 3, 6, 9))  # features of edges between bodies
+SDF_SIM = Layout(
+    {"body": NODE, "node": NODE},
+    {
+        "intra_up": EdgeKind("node", "body", INTRA), "intra_down": EdgeKind("body", "node", INTRA),
+        "contact_up": EdgeKind("node", "body", CONTACT), "contact_down": EdgeKind("body", "node", CONTACT),
+    },
+)  # fmt: skip
 TARGET = Features(3, (0,))  # accelerations
 # Weight of staying at `start`, relative to the nodes' spread. It is far below the weight of any extent beyond rounding,
 # so it decides only about rotations that the nodes do not define.
 STAY = 1e-12
 _NOT_PER_BODY = ("node", "node_start")
+
+
+@dataclass(frozen=True)
+class BodyTensors:
+    """The fields of `Bodies` that such a network needs, for N bodies with M surface nodes."""
+
+    inverse_mass: Tensor  # [N] float64
+    friction: Tensor  # [N] float64
+    restitution: Tensor  # [N] float64
+    moves: Tensor  # [N] bool
+    size: Tensor  # [N] float64
+    node: Tensor  # [M, 3] float64
+    node_start: Tensor  # [N + 1] int64
+
+    def __len__(self) -> int:
+        return len(self.moves)
+
+    @property
+    def device(self) -> torch.device:
+        return self.moves.device
+
+
+@dataclass(frozen=True)
+class StateTensors:
+    """Poses and velocities of N bodies, float64; see `State`."""
+
+    position: Tensor  # [N, 3]
+    orientation: Tensor  # [N, 4]
+    velocity: Tensor  # [N, 3]
+    angular_velocity: Tensor  # [N, 3]
+    earlier_position: Tensor | None = None  # [2, N, 3]
+    earlier_orientation: Tensor | None = None  # [2, N, 4]
+
+
+def body_tensors(bodies: Bodies, device: torch.device) -> BodyTensors:
+    return BodyTensors(**{f.name: torch.from_numpy(getattr(bodies, f.name)).to(device) for f in fields(BodyTensors)})
+
+
+def state_tensors(state: Motion, device: torch.device) -> StateTensors:
+    arrays = {f.name: getattr(state, f.name, None) for f in fields(StateTensors)}
+    return StateTensors(**{k: torch.from_numpy(v).to(device) for k, v in arrays.items() if v is not None})
+
+
+def state_arrays(state: StateTensors) -> State:
+    tensors: dict[str, Any] = {f.name: getattr(state, f.name) for f in fields(state)}
+    return State(**{k: v.cpu().numpy() for k, v in tensors.items() if v is not None})
+
+
+@dataclass(frozen=True)
+class Contacts:
+    """E contact edges, each from a surface node to the closest point on another body; model units, world frame."""
+
+    owner: Tensor  # [E] int64, the body whose node it is
+    node: Tensor  # [E] int64, index into `Bodies.node`
+    body: Tensor  # [E] int64, the body that it is near
+    seen: Tensor  # [E, 3] float64, the node relative to the centre of mass of `body`
+    distance: Tensor  # [E] float64, signed distance of the node from `body`
+    normal: Tensor  # [E, 3] float64, unit outward normal of `body` at the closest point
+
+    def __len__(self) -> int:
+        return len(self.owner)
+
+
+def no_contacts(device: torch.device) -> Contacts:
+    nobody = torch.zeros(0, dtype=torch.int64, device=device)
+    nothing = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return Contacts(nobody, nobody, nobody, nothing, nothing[:, 0], nothing)
+
+
+def find_contacts(
+    bodies: BodyTensors, state: StateTensors, gravity: np.ndarray, reach: float, dt: float, scene: Compiled | None
+) -> Contacts:
+    """All contact edges of a state within `reach` (the contact radius D) under gravity [3], found with the compiled
+    `scene`; all in model units."""
+    assert scene is not None
+    found = nodes_near(scene, state_arrays(state), gravity, reach, dt)
+    index, value = (torch.from_numpy(array).to(bodies.device) for array in found)
+    owner, node, body = index.unbind(1)
+    return Contacts(owner, node, body, seen=value[:, 4:], distance=value[:, 0], normal=value[:, 1:4])
+
+
+def where(state: StateTensors, bodies: BodyTensors, contacts: Contacts) -> Tensor:
+    """[E, 3] positions of the nodes of contact edges in a state, world."""
+    turned = pose.rotate(state.orientation[contacts.owner], bodies.node[contacts.node])
+    return state.position[contacts.owner] + turned
 
 
 def node_owner(bodies: BodyTensors) -> Tensor:
@@ -50,7 +150,10 @@ def compact(
         earlier_position=earlier_position[:, rows],
         earlier_orientation=earlier_orientation[:, rows],
     )
-    return some, moved, contacts.renumbered(number, place)
+    among = replace(
+        contacts, owner=number[contacts.owner], body=number[contacts.body], node=place[contacts.node]
+    )  # fmt: skip
+    return some, moved, among
 
 
 def _numbers(kept: Tensor, count: int) -> Tensor:
@@ -100,6 +203,25 @@ def star(bodies: BodyTensors, state: StateTensors) -> dict[str, EdgeSet]:
     features = torch.cat([now, now.norm(dim=-1, keepdim=True), rest, rest.norm(dim=-1, keepdim=True)], -1).float()
     node = torch.arange(len(owner), device=owner.device)
     return {"intra_up": EdgeSet(features, node, owner), "intra_down": EdgeSet(features, owner, node)}
+
+
+def sdf_sim_graph(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> MultiGraph:
+    features = _contact_features(bodies, state, contacts).float()
+    node, body = contacts.node, contacts.body
+    edges = {"contact_up": EdgeSet(features, node, body), "contact_down": EdgeSet(features, body, node)}
+    return MultiGraph(motion_features(bodies, state), star(bodies, state) | edges)
+
+
+def _contact_features(bodies: BodyTensors, state: StateTensors, contacts: Contacts) -> Tensor:
+    """[E, 15]: node to closest point, normal, both relative to the other body's centre, and distances. An infinite
+    floor has no centre: the closest point takes its place."""
+    c = contacts
+    to_closest = -c.distance[:, None] * c.normal
+    bounded = bodies.size[c.body].isfinite()[:, None]
+    seen = torch.where(bounded, c.seen, -to_closest)
+    closest = seen + to_closest
+    lengths = [c.distance, seen.norm(dim=-1), closest.norm(dim=-1)]
+    return torch.cat([to_closest, c.normal, seen, closest, torch.stack(lengths, -1)], -1)
 
 
 def advance(bodies: BodyTensors, state: StateTensors, acceleration: Tensor, dt: float) -> StateTensors:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from sdfsim.base.errors import SdfsimError
+from sdfsim.base.errors import SdfsimError, warn_once
 from sdfsim.base.parallel import Progress, silent
-from sdfsim.base.warned import warn_once
 from sdfsim.geometry.mesh_io import load_textured
 from sdfsim.scene.bundled import find_scene
 from sdfsim.scene.document import Document, Faults

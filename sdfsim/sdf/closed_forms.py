@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -210,6 +210,16 @@ class TorusSdf(ClosedForm):
 CLOSED_FORMS = {kind.KIND: kind for kind in (PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf, ConeSdf, TorusSdf)}
 # Those that other programs have too.
 COMMON_FORMS = PlaneSdf, SphereSdf, BoxSdf, CapsuleSdf, CylinderSdf
+
+
+def sizes_in_scene(form: ClosedForm) -> dict[str, Any]:
+    """The sizes in m of a closed form, as scene files have them; none of a plane."""
+    if isinstance(form, BoxSdf):
+        return {"size": [2.0 * half for half in form.half]}
+    if isinstance(form, CapsuleSdf | CylinderSdf | ConeSdf):
+        caps = form.radius if isinstance(form, CapsuleSdf) else 0.0
+        return {"radius": form.radius, "height": 2.0 * (form.half + caps)}
+    return vars(form)
 
 
 def _outward(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass, field
 from itertools import pairwise
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from sdfsim.base.lazy import made_once
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf
 from sdfsim.sdf.sdf import Sdf
@@ -112,14 +112,9 @@ def _around(corners: np.ndarray, chosen: np.ndarray, normal: np.ndarray) -> np.n
     return loop if len(loop) <= CORNERS else loop[np.linspace(0, len(loop), CORNERS, endpoint=False).astype(int)]
 
 
-_convex: WeakKeyDictionary[Mesh, np.ndarray] = WeakKeyDictionary()
-
-
 def convex_vertices(mesh: Mesh) -> np.ndarray:
     """[V, 3] m, the vertices of a mesh that is convex except for small dents and rounding; empty for other meshes."""
-    if mesh not in _convex:
-        _convex[mesh] = mesh.vertices if _is_convex(mesh) else np.zeros((0, 3))
-    return _convex[mesh]
+    return mesh.vertices if made_once(mesh, _is_convex) else np.zeros((0, 3))
 
 
 def _is_convex(mesh: Mesh) -> bool:

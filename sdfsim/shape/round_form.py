@@ -8,7 +8,7 @@ import numpy as np
 
 from sdfsim.geometry.mass import mass_properties
 from sdfsim.geometry.mesh import Mesh, is_closed
-from sdfsim.sdf.closed_forms import CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf, TorusSdf
+from sdfsim.sdf.closed_forms import CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf, TorusSdf, sizes_in_scene
 
 OFF = 1e-3  # relative to the largest extent: how far a vertex may be from the round surface
 FACET = 0.04  # relative to the least radius: how deep a facet may lie; with twelve around, 0.034
@@ -52,7 +52,7 @@ def round_form(mesh: Mesh) -> RoundForm | None:
             if _is(form, places - (0.0, 0.0, up), mesh.faces):
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = frame, com + up * frame[:, 2]
-                return RoundForm(form.KIND, _sizes(form), pose)
+                return RoundForm(form.KIND, sizes_in_scene(form), pose)
     return None
 
 
@@ -66,13 +66,6 @@ def _fits(places: np.ndarray, half: float) -> Iterator[SphereSdf | CylinderSdf |
         yield CapsuleSdf(radius, half - radius)
     if radius > 2.0 * half:
         yield TorusSdf(radius - half, half)
-
-
-def _sizes(form: Any) -> dict[str, float]:
-    if isinstance(form, SphereSdf | TorusSdf):
-        return vars(form)
-    caps = form.radius if isinstance(form, CapsuleSdf) else 0.0
-    return {"radius": form.radius, "height": 2.0 * (form.half + caps)}
 
 
 def _is(form: Any, places: np.ndarray, faces: np.ndarray) -> bool:

@@ -1,7 +1,5 @@
 """The triangles of a closed mesh in a tree of boxes, for exact distances in the contact solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -6,15 +6,15 @@ the frames of bodies, so nothing is built again when bodies move.
 
 from __future__ import annotations
 
-import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sdfsim.base.errors import SdfsimError, nearest
+from sdfsim.base.lazy import made_once
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh, lattice
 from sdfsim.physics import pose
@@ -201,7 +201,9 @@ class Camera:
         pixels, label = pixels.reshape(tall, wide, 4), label.reshape(tall, wide)
         if style.smooth:
             edge, shadow = _edges(label), _edges(np.where(label >= 0, label % 2, -1)) & ~_edges(label // 2)
-            often = np.flatnonzero(edge | _widened(shadow, max(1, round(_FAR_EDGE * tall))))
+            from scipy.ndimage import maximum_filter  # slow to load
+
+            often = np.flatnonzero(edge | maximum_filter(shadow, 2 * max(1, round(_FAR_EDGE * tall)) + 1))
             if len(often):
                 again, *_ = drawn.look((self._grid[often][:, None] + _SUB).reshape(-1, 2), drawn.suns(often, wide))
                 pixels.reshape(-1, 4)[often] = again.reshape(-1, len(_SUB), 4).mean(1)
@@ -245,12 +247,6 @@ def _edges(label: np.ndarray) -> np.ndarray:
     return edge
 
 
-def _widened(mask: np.ndarray, by: int) -> np.ndarray:
-    from scipy.ndimage import maximum_filter  # slow to load
-
-    return maximum_filter(mask, 2 * by + 1)
-
-
 def _finished(pixels: np.ndarray, background: Sequence[int] | None) -> np.ndarray:
     """Colours uint8 from [..., 4]: RGB that are multiplied by alpha (0 to 1), and alpha."""
     color, alpha = pixels[..., :3], pixels[..., 3:]
@@ -261,15 +257,9 @@ def _finished(pixels: np.ndarray, background: Sequence[int] | None) -> np.ndarra
     return np.clip(color + 0.5, 0, 255).astype(np.uint8)
 
 
-_KEPT: dict[int, Any] = {}
-
-
-def _kept(of: Any, make: Callable[[Any], Any]) -> Any:
-    """What `make` made of an object; it is kept as long as the object is."""
-    if id(of) not in _KEPT:
-        _KEPT[id(of)] = make(of)
-        weakref.finalize(of, _KEPT.pop, id(of), None)
-    return _KEPT[id(of)]
+def _looks(scene: Scene) -> tuple[float, np.ndarray]:
+    """Radius m of a ball around a scene, and the colours [N, 3] of its bodies."""
+    return framed(scene)[1], np.array(body_colors(scene), np.float32)
 
 
 class _Model:
@@ -328,7 +318,7 @@ class _Drawing:
             if not 0.0 <= value <= 1.0:
                 raise SdfsimError(f"opacity of {name!r}: must be from 0 to 1 (got {value:g})")
             opacity[names[name]] = value
-        self.radius, colors = _kept(scene, lambda of: (framed(of)[1], np.array(body_colors(of), np.float32)))
+        self.radius, colors = made_once(scene, _looks)
         if ghosts is not None:
             rows, opacity = np.append(rows, ghosts.rows), np.append(opacity, [ghosts.opacity] * len(ghosts.rows))
             position = np.concatenate([position, ghosts.position])
@@ -353,7 +343,7 @@ class _Drawing:
         across = _aside(self.sun)
         self.across = np.stack([across, np.cross(self.sun, across)], 1).astype(np.float32)  # [3, 2] axes aside
         self.models: list[_Model | None] = [
-            None if plane or not len(shape.shown.faces) else _kept(shape, _Model)
+            None if plane or not len(shape.shown.faces) else made_once(shape, _Model)
             for shape, plane in zip(shapes, flat, strict=True)
         ]
         meshed = [k for k, model in enumerate(self.models) if model is not None and opacity[k] > 0.0]

@@ -80,7 +80,7 @@ class JointHandle:
         """[4] of a ball, the turn of the first body from the start of the scene, as the second body sees it, in the
         world's axes at the start; the ball's axis, if it has one, is x. Raises SdfsimError for any other joint."""
         self._need("quat_xyzw", "ball")
-        return pose.from_rotvec(self._simulator.joint_positions[self._columns])
+        return pose.from_rotvec(self._simulator.joint_positions[self._simulator.joint_columns[self.name]])
 
     @quat_xyzw.setter
     def quat_xyzw(self, quat: Numbers) -> None:
@@ -235,10 +235,6 @@ class JointHandle:
             beyond = f"{what} {found:g} is beyond the limits, {ends[0]:.4g} to {ends[1]:.4g}"
             raise SdfsimError(f"joint {self.name!r}: {beyond}", "the limits are joints[].limits of the scene")
         self._simulator.move_joints({self._row: found}, {})
-
-    @property
-    def _columns(self) -> slice:
-        return self._simulator.joint_columns[self.name]
 
     @property
     def _joint(self) -> Joint:

@@ -28,8 +28,7 @@ from sdfsim.physics.rollout import Rollout, join
 from sdfsim.physics.steps import Frames
 from sdfsim.physics.units import inner_steps
 from sdfsim.physics.validity import Fault, check_nodes, check_sizes, first_fault
-from sdfsim.scene.builder import SceneBuilder, loaded, plain, validated
-from sdfsim.scene.keys import BodyKeys
+from sdfsim.scene.builder import BodyKeys, SceneBuilder, loaded, plain, validated
 from sdfsim.scene.plan import plan
 from sdfsim.scene.scene import Body, Keyframe, Scene
 from sdfsim.scene.schema import BodyTable

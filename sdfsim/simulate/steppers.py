@@ -35,8 +35,7 @@ from sdfsim.shape.shape import Shape
 
 if TYPE_CHECKING:  # numba and torch are slow to load
     from sdfsim.learned.impulse import ImpulseNetwork
-    from sdfsim.learned.near import Contacts
-    from sdfsim.learned.tensors import BodyTensors
+    from sdfsim.learned.surfaces import BodyTensors, Contacts
     from sdfsim.physics.solver.prepare import Compiled, SharedShapes
 
 FreeFlight = Literal["exact", "learned"]
@@ -249,9 +248,8 @@ class OnSurfaces(Stepper):
         return next(iter(self.model.network.state_dict().values())).device
 
     def surface(self, shape: Shape) -> Shape:
-        from sdfsim.learned.graphs import points
-
-        return points(shape, self.model.nodes)
+        """The shape with its first nodes: the outermost ones, then the most evenly spread."""
+        return replace(shape, nodes=shape.nodes[: self.model.nodes])
 
     def began(self, state: State, bodies: Bodies, options: Options) -> State:
         return with_history(state, bodies, options)
@@ -266,15 +264,14 @@ class OnSurfaces(Stepper):
         """The edges were found at the start of the step; their points are returned for the poses of `state`."""
         if carry is None or carry.near is None or not len(near := carry.near):
             return super().touching(state, carry)
-        from sdfsim.learned.near import where
-        from sdfsim.learned.tensors import state_tensors
+        from sdfsim.learned.surfaces import state_tensors, where
 
         pairs = np.stack([near.owner.cpu().numpy(), near.body.cpu().numpy()], -1)
         points = where(state_tensors(state, self.device), self._tensors(carry), near).cpu().numpy()
         return points, pairs, float((-near.distance).clamp_min(0.0).max())
 
     def _tensors(self, carry: Carry) -> BodyTensors:
-        from sdfsim.learned.tensors import body_tensors
+        from sdfsim.learned.surfaces import body_tensors
 
         if carry.tensors is None:
             bodies = carry.bodies
@@ -288,10 +285,14 @@ class OnSurfaces(Stepper):
     def _step(self, state: State, carry: Carry) -> State:
         import torch
 
-        from sdfsim.learned.graphs import sdf_sim_graph
-        from sdfsim.learned.near import find_contacts, no_contacts
-        from sdfsim.learned.surfaces import compact, predict
-        from sdfsim.learned.tensors import state_tensors
+        from sdfsim.learned.surfaces import (
+            compact,
+            find_contacts,
+            no_contacts,
+            predict,
+            sdf_sim_graph,
+            state_tensors,
+        )
 
         options, tensors = carry.options, self._tensors(carry)
         if state.earlier_position is None:  # from a stepper that needs no earlier positions

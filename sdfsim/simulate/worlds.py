@@ -1,7 +1,5 @@
 """`Batch`: many worlds of one scene in one compiled call, for learning."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """One training run: everything that changes during training, and how it is saved."""
 
-from __future__ import annotations
-
 import json
 import math
 from copy import deepcopy

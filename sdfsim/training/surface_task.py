@@ -1,6 +1,6 @@
 """The task of training a network on surface nodes: recorded steps of whole scenes, and a loss on node accelerations."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,16 @@ from torch import Tensor
 from sdfsim.base.files import digest
 from sdfsim.data.batching import centred, merged, state_at
 from sdfsim.data.dataset import Trajectory, check_alike, conditions_of, load_shapes, ranges_of, trajectory_files
-from sdfsim.learned.graphs import points, sdf_sim_graph
 from sdfsim.learned.message_passing import GraphNetwork, MultiGraph, flipped
-from sdfsim.learned.near import find_contacts
-from sdfsim.learned.surfaces import TARGET, node_owner, target_acceleration
-from sdfsim.learned.tensors import body_tensors, state_tensors
+from sdfsim.learned.surfaces import (
+    TARGET,
+    body_tensors,
+    find_contacts,
+    node_owner,
+    sdf_sim_graph,
+    state_tensors,
+    target_acceleration,
+)
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State, Units, largest_extent
 from sdfsim.physics.solver.prepare import Compiled, SharedShapes
@@ -44,7 +49,7 @@ class SurfaceTask:
         check_alike(f"{data / split}", self.trajectories)
         names = {str(n) for t in self.trajectories for n in t.shape}
         self.nodes = plan.nodes
-        self.shapes = {k: points(centred(s), plan.nodes) for k, s in load_shapes(data, names).items()}
+        self.shapes = {k: replace(centred(s), nodes=s.nodes[: plan.nodes]) for k, s in load_shapes(data, names).items()}
         self.reach, self.noise = plan.reach, plan.noise if noisy else None
         self.counts = [len(self.trajectories)]
         self.dt = self.trajectories[0].dt

@@ -29,8 +29,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import by_model, start_of_scene, still
 from sdfsim.evaluation.laws import hard_cases
-from sdfsim.evaluation.laws.check import Check, most, near
-from sdfsim.evaluation.laws.scenes import UNIT, G, Law, Put, Setting, about, fixed, floor, run, solid
+from sdfsim.evaluation.laws.scenes import UNIT, Check, G, Law, Put, Setting, about, fixed, floor, most, near, run, solid
 from sdfsim.evaluation.laws.table import ROWS
 from sdfsim.learned.model import load_model
 from sdfsim.scene.load import load_scene

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.evaluation.engines import Ran, scene_rollout, start_motion
 from sdfsim.evaluation.instruments import depths
 from sdfsim.evaluation.laws import hard_cases
-from sdfsim.evaluation.laws.check import Check
+from sdfsim.evaluation.laws.scenes import Check
 from sdfsim.evaluation.metrics import compared, energy, energy_gain, resting, speeds, survival
 from sdfsim.scene.scene import Scene
 from tests.helpers.recordings import balls

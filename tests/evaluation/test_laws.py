@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from sdfsim.evaluation.laws.assembly import ASSEMBLY
-from sdfsim.evaluation.laws.check import Check, most, near
 from sdfsim.evaluation.laws.everyday import EVERYDAY
 from sdfsim.evaluation.laws.joints import JOINTS
-from sdfsim.evaluation.laws.scenes import Setting
+from sdfsim.evaluation.laws.scenes import Check, Setting, most, near
 from sdfsim.evaluation.laws.table import ROWS, checks, laws
 from sdfsim.evaluation.laws.textbook import TEXTBOOK
 from tests.helpers.everyday import COUNTS, MISSED

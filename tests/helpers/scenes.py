@@ -7,8 +7,14 @@ import pytest
 import torch
 
 from sdfsim.learned.model import Model, new_network
-from sdfsim.learned.near import Contacts, find_contacts
-from sdfsim.learned.tensors import BodyTensors, StateTensors, body_tensors, state_tensors
+from sdfsim.learned.surfaces import (
+    BodyTensors,
+    Contacts,
+    StateTensors,
+    body_tensors,
+    find_contacts,
+    state_tensors,
+)
 from sdfsim.physics import pose
 from sdfsim.physics.bodies import Bodies, State
 from sdfsim.physics.solver.prepare import Compiled

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sdfsim.base.errors import SdfsimError
-from sdfsim.learned.graphs import SDF_SIM, sdf_sim_graph
+from sdfsim.learned.surfaces import SDF_SIM, sdf_sim_graph
 from sdfsim.physics.bodies import Units, from_scene
 from sdfsim.physics.free_flight import with_history
 from sdfsim.physics.options import Options

@@ -7,7 +7,7 @@ import pytest
 
 from pipeline.mesh.surroundings import surroundings_of
 from pipeline.stereo.depth import DepthMap
-from pipeline.stereo.far import load, save, surrounding_distance
+from pipeline.stereo.fusion import load_far, save_far, surrounding_distance
 from sdfsim.geometry.bvh import ClosestPoint
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.geometry.primitives import sphere
@@ -49,8 +49,8 @@ def seen(tmp_path_factory):
     noisy = [replace(one, inverse=one.inverse * off) for one, off in zip(maps, wrong, strict=True)]
     far = surrounding_distance(noisy)
     assert far is not None and WALL < far.reach < 2 * WALL
-    save(far, folder)
-    kept = load(folder)
+    save_far(far, folder)
+    kept = load_far(folder)
     assert kept is not None and np.allclose(kept.values, far.values, atol=0.01)
     ball = sphere(1.0)
     table = Mesh(ball.vertices * 0.8 / np.ptp(ball.vertices, axis=0).max(), ball.faces)

@@ -9,7 +9,7 @@ import sdfsim
 from sdfsim import SceneError
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh_io import wavefront
-from sdfsim.scene.keys import BodyKeys, JointKeys
+from sdfsim.scene.builder import BodyKeys, JointKeys
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.schema import BodyTable, JointTable, ShapeTable
 

@@ -8,9 +8,7 @@ import torch
 
 from sdfsim.geometry import primitives
 from sdfsim.learned import inference
-from sdfsim.learned.graphs import sdf_sim_graph
-from sdfsim.learned.surfaces import predict
-from sdfsim.learned.tensors import state_arrays
+from sdfsim.learned.surfaces import predict, sdf_sim_graph, state_arrays
 from sdfsim.physics.solver import prepare as solver
 from sdfsim.scene.scene import Effects, Scene, Waypoints
 from sdfsim.shape import contact_geometry

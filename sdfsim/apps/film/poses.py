@@ -200,10 +200,10 @@ def axes(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> np.ndarra
     large = max(look.radius / pixel, 1.0)
     shift = eye.rotation.T @ np.stack([[pixel, 0, 0], [0, pixel, 0], local / large], 1)
     about = eye.rotation.T
-    if look.ways == 5:  # about two axes across its own
+    if look.axis is not None:  # about two axes across its own
         own = pose.rotate(turn, look.axis)
         about = np.linalg.svd(own[None])[2][1:].T
-    return block_diag(shift, about[:, : look.ways - 3] / large)
+    return np.asarray(block_diag(shift, about[:, : look.ways - 3] / large))
 
 
 def fitted(

@@ -224,7 +224,7 @@ def without_others(clip: Clip, eye: Eye, track: Track) -> Track:
     for order in (rows[rows > best], rows[rows < best][::-1]):
         last = best
         for k in order.tolist():
-            if not _jumps(track.look, eye, track.at(k), track.at(last), clip.time[k] - clip.time[last]):
+            if not _jumps(track.look, eye, track.at(k), track.at(last), float(clip.time[k] - clip.time[last])):
                 last, seen[k] = k, track.at(k)
     return Track(track.look, seen)
 
@@ -265,7 +265,7 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
         if one is None or _repainted(look, one, first):
             continue
-        if _jumps(look, eye, one, before[0][1], clip.time[at] - clip.time[before[0][0]]):
+        if _jumps(look, eye, one, before[0][1], float(clip.time[at] - clip.time[before[0][0]])):
             continue
         if odd(one, likely) < least:
             best, least = one, odd(one, likely)

@@ -1,8 +1,6 @@
 """`play`: a scene, a room, a shape, a mesh or a robot runs live on a page in the browser. `show`: a run that is
 over."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +49,7 @@ class Playing:
         self.session.close()
         self.page.close()
 
-    def __enter__(self) -> Playing:
+    def __enter__(self) -> "Playing":
         return self
 
     def __exit__(self, *error: object) -> None:

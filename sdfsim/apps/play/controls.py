@@ -1,7 +1,5 @@
 """The page on which a person plays with a session: the mouse, the keys and the panel."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +10,6 @@ import numpy as np
 from sdfsim.apps.page import Batch, Page
 from sdfsim.apps.play.session import MINUTE, Session
 from sdfsim.base.errors import SdfsimError
-from sdfsim.geometry.mesh import convex_hull
 from sdfsim.physics import pose
 from sdfsim.scene.bundled import sample_folder
 from sdfsim.scene.scene import Scene
@@ -297,8 +294,7 @@ class Controls(Page):
                                   point_shape="circle")  # fmt: skip
         if on["Pieces of the body"].value:
             rng = np.random.default_rng(0)
-            pieces = [convex_hull(p) for p in shape.pieces] if shape.pieces else own_pieces(shape)
-            for k, piece in enumerate(pieces[:MOST_PIECES]):
+            for k, piece in enumerate(own_pieces(shape)[:MOST_PIECES]):
                 places, color = (piece.vertices - shape.com) * body.scale, tuple(rng.integers(60, 230, 3).tolist())
                 drawn.add_mesh_simple(f"/picked/pieces/{k}", places, piece.faces, color=color, opacity=0.55,
                                       flat_shading=True)  # fmt: skip

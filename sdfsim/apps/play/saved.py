@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from sdfsim.apps.export import plain_names
 from sdfsim.apps.run import summary
 from sdfsim.base.console import plain as plain_report
+from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import CONFIG, check_own, check_writable, write_json, write_text
 from sdfsim.physics import pose
 from sdfsim.physics.rollout import Rollout
@@ -19,9 +20,11 @@ from sdfsim.scene.builder import SceneBuilder, plain
 from sdfsim.scene.joints import joint_axes
 from sdfsim.scene.load import load_scene
 from sdfsim.scene.scene import WORLD, Body, Coupling, Frame, Joint, Keyframe, Scene, fingerprints
-from sdfsim.sdf.closed_forms import BoxSdf, CapsuleSdf, ConeSdf, CylinderSdf, SphereSdf, TorusSdf
+from sdfsim.sdf.closed_forms import ClosedForm, sizes_in_scene
 from sdfsim.shape.shape import Shape
 from sdfsim.simulate.looks import is_infinite
+from sdfsim.simulate.record import Recording, at_frame
+from sdfsim.simulate.simulator import Simulator
 
 SCENE = "scene.yaml"
 
@@ -46,7 +49,7 @@ def save_scene(scene: Scene, folder: Path) -> Path:
     return built.save(folder / SCENE)
 
 
-def save_run(scene: Scene, rollout: Rollout, folder: Path) -> Path:
+def write_run(scene: Scene, rollout: Rollout, folder: Path) -> Path:
     """Write the motion of a scene, whose bodies are as in the first frame, as a run folder that the other commands
     read. Returns the folder. Raises SdfsimError as `save_scene` does, and if the folder holds other results."""
     check_own(folder, "play", "rollout.npz", "report.json")
@@ -62,21 +65,23 @@ def save_run(scene: Scene, rollout: Rollout, folder: Path) -> Path:
     return folder
 
 
+def save_run(simulator: Simulator, run: Recording | Rollout, folder: Path | str) -> Path:
+    """Write a recording of a simulator as a run folder, which `view`, `render`, `export` and `identify` read: its
+    motion, with joints, efforts and forces, and its scene as it was in the first frame. Returns the folder. Raises
+    SdfsimError if the recording has no step or is of other bodies, or if the folder holds other results."""
+    rollout = run.rollout if isinstance(run, Recording) else run
+    if rollout.names != tuple(body.name for body in simulator.scene.bodies):
+        raise SdfsimError(
+            "run: its bodies are not those of the simulator", "save it before bodies are added or removed"
+        )
+    if not len(rollout):
+        raise SdfsimError("run: has no step", "make steps inside the block: with simulator.record() as run: ...")
+    return write_run(at_frame(simulator.scene, rollout), rollout, Path(folder))
+
+
 def _shape(shape: Shape, folder: Path) -> dict[str, Any]:
-    sdf = shape.sdf
-    if set(shape.source) == {"kind"}:
-        if isinstance(sdf, SphereSdf):
-            return {"sphere": {"radius": sdf.radius}}
-        if isinstance(sdf, BoxSdf):
-            return {"box": {"size": [2.0 * half for half in sdf.half]}}
-        if isinstance(sdf, CapsuleSdf):
-            return {"capsule": {"radius": sdf.radius, "height": 2.0 * (sdf.half + sdf.radius)}}
-        if isinstance(sdf, CylinderSdf):
-            return {"cylinder": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
-        if isinstance(sdf, ConeSdf):
-            return {"cone": {"radius": sdf.radius, "height": 2.0 * sdf.half}}
-        if isinstance(sdf, TorusSdf):
-            return {"torus": {"radius": sdf.radius, "tube": sdf.tube}}
+    if set(shape.source) == {"kind"} and isinstance(shape.sdf, ClosedForm):
+        return {shape.sdf.KIND: sizes_in_scene(shape.sdf)}
     return {"asset": shape.save(folder).resolve()}
 
 

@@ -4,8 +4,6 @@ It knows nothing of pages. `Session.call` runs a command between two steps. With
 once, and `advance` or `step` makes steps.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -21,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from sdfsim.apps.play.hand import Hand
-from sdfsim.apps.play.saved import save_run, save_scene
+from sdfsim.apps.play.saved import save_scene, write_run
 from sdfsim.base.errors import SdfsimError
+from sdfsim.base.lazy import made_once
 from sdfsim.evaluation.instruments import judged
 from sdfsim.geometry.bvh import Caster
 from sdfsim.physics import pose
@@ -92,7 +91,6 @@ class Session:
         self.middle, self.wide = framed(simulator.scene)  # of the start: balls that were thrown fly far
         self._kept: deque[tuple[float, Snapshot, int]] = deque()  # time, snapshot, bytes
         self._passed: deque[tuple[float, float]] = deque()  # real and simulated time
-        self._casters: dict[int, tuple[Shape, Caster]] = {}  # by the id of the shape, which is kept with it
         self._record()
         self._keep()
         self._show()
@@ -381,11 +379,8 @@ class Session:
             if is_infinite(shape):
                 away = -start[2] / way[2] if way[2] < 0.0 else np.inf
             else:
-                if id(shape) not in self._casters:
-                    self._casters[id(shape)] = shape, Caster(shape.mesh)
-                caster = self._casters[id(shape)][1]
                 ray = np.concatenate([start / body.scale + shape.com, way / body.scale]).astype(np.float32)
-                away = float(caster.cast(ray[None])[0][0])
+                away = float(made_once(shape.mesh, Caster).cast(ray[None])[0][0])
             if 0.0 < away < (np.inf if best is None else best[1]):
                 best = body.name, away
         return best
@@ -433,7 +428,7 @@ class Session:
     def save_run(self, folder: Path | str) -> Path:
         """Write the motion since the scene was changed last as a run folder. Raises SdfsimError as `save_scene`."""
         scene, rollout = self.call(lambda: (self.simulator.scene, self.recording.rollout))
-        return save_run(at_frame(scene, rollout), rollout, Path(folder))
+        return write_run(at_frame(scene, rollout), rollout, Path(folder))
 
     def _put(self, name: str, shape: Shape, body: Body, spot: Any = None, **fields: Any) -> str:
         """Add a body of a shape; with a `spot` so high above it that it lies free."""

@@ -6,12 +6,11 @@ from functools import cache
 from math import cos, pi, radians, sin, sqrt, tan
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import UNIT, G, Put, Ran, Setting, about, fixed, floor, run, run_built, solid
+from sdfsim.evaluation.laws.scenes import UNIT, Check, G, Put, Ran, Setting, about, fixed, floor, run, run_built, solid
 from sdfsim.geometry.mesh import Mesh, clean, joined
 from sdfsim.geometry.mesh_io import write_ply
 from sdfsim.geometry.primitives import box, cylinder, revolve, ring, sleeve, torus, tube
@@ -123,14 +122,14 @@ def ring_gear(teeth: int, module: float, height: float) -> Mesh:
     return sleeve((0.5 * teeth + 4) * module * rim / np.linalg.norm(rim, axis=1, keepdims=True), rim, height)
 
 
-class Files:
+class Files(TemporaryDirectory):
     """Meshes as files, until the scene is read."""
 
-    def __init__(self, folder: str) -> None:
-        self.folder = Path(folder)
+    def __enter__(self) -> Self:
+        return self
 
     def __call__(self, name: str, mesh: Mesh) -> str:
-        path = self.folder / f"{name}.ply"
+        path = Path(self.name) / f"{name}.ply"
         path.write_bytes(write_ply(mesh))
         return str(path)
 
@@ -146,8 +145,7 @@ def gears(at: Setting) -> Iterator[Check]:
     tooth that is skipped."""
     built, planets = SceneBuilder(gravity=(0, 0, 0)), SceneBuilder(gravity=(0, 0, 0))
     spins: dict[str, Any] = {"axis": (0, 0, 1)}
-    with TemporaryDirectory() as folder:
-        mesh = Files(folder)
+    with Files() as mesh:
         for name, teeth, place, turn in (("small", 20, 0.0, 0.0), ("large", 40, 0.15, 180 + 180 / 40)):
             gear = mesh(name, spur_gear(teeth, 5e-3, 0.02))
             built.add(name, mesh=gear, position=(place, 0, 0), mass=0.1, euler_xyz_deg=(0, 0, turn))
@@ -221,8 +219,7 @@ def nuts(at: Setting) -> Iterator[Check]:
             full = G * lead / (lead**2 + spin) * ran.time[-1]
             yield ran.between("speed of a true screw", -spins[-1] / full, 0.75, 1.01, "")
     built, start = SceneBuilder(), (0, 0, 6 * pitch)
-    with TemporaryDirectory() as folder:
-        mesh = Files(folder)
+    with Files() as mesh:
         built.add("bolt", mesh=mesh("bolt", screw), motion="static")
         built.add("nut", mesh=mesh("nut", female), position=start, mass=0.02, friction=0.2)
         built.add("driver", box={"size": [5e-3, 5e-3, 5e-3]}, position=(0, 0, 0.05), mass=0.02, collides_with=[])
@@ -241,8 +238,7 @@ def bearings(at: Setting) -> Iterator[Check]:
     which they roll, and friction takes little of the spin."""
     middle, ball, groove, play = 20e-3, 3e-3, 3.12e-3, 1e-5  # m: the radius of the orbit; radii; on each side
     built = SceneBuilder()
-    with TemporaryDirectory() as folder:
-        mesh = Files(folder)
+    with Files() as mesh:
         for name, side in (("outer", 1), ("inner", -1)):
             centre, edge = middle + side * (ball + play - groove), middle + side * 0.6 * ball
             half = np.arccos(side * (edge - centre) / groove)
@@ -282,8 +278,8 @@ def bricks(at: Setting) -> Iterator[Check]:
         parts.append(Mesh(stud.vertices + np.array([x * studs, y * studs, high + 4e-4]), stud.faces))
     for weight, holds in ((1.0, True), (10.0, False)):
         built = SceneBuilder()
-        with TemporaryDirectory() as folder:
-            brick = Files(folder)("brick", joined(parts))
+        with Files() as mesh:
+            brick = mesh("brick", joined(parts))
             built.add("upper", mesh=brick, position=(0, 0, high + 1e-5), motion="static")
             built.add("lower", mesh=brick, mass=weight / G, stiffness=stiffness, damping=5.0)
             ran = run_built(at, f"{weight:g} N", built, 0.3)
@@ -299,8 +295,8 @@ def links(at: Setting) -> Iterator[Check]:
     times = np.linspace(0, 4, 201)
     along = 0.1 * np.sin(2 * pi * times) * (1 - np.exp(-times))
     path = [{"time": t, "position": (x, 0, 0), "euler_xyz_deg": (90, 0, 0)} for t, x in zip(times, along, strict=True)]
-    with TemporaryDirectory() as folder:
-        ring = Files(folder)("ring", torus(20e-3, 4e-3, 96, 32))
+    with Files() as mesh:
+        ring = mesh("ring", torus(20e-3, 4e-3, 96, 32))
         built.add("link0", mesh=ring, motion="kinematic", path=path)
         for k in range(1, 50):
             turn = (90, 0, 90 * (k % 2))
@@ -388,13 +384,13 @@ def keys(at: Setting) -> Iterator[Check]:
     """A key that is pushed into a lock lifts its plates to where they clear the housing; it turns the plug then, and
     another key does not."""
     path = [{"time": 0, "position": (0, 0, -14e-3)}, {"time": 1.0, "position": (0, 0, 0)}]
-    with TemporaryDirectory() as folder:
-        ran = run_built(at, "pushed in", lock(Files(folder), CUTS, motion="kinematic", path=path), 1.05)
+    with Files() as mesh:
+        ran = run_built(at, "pushed in", lock(mesh, CUTS, motion="kinematic", path=path), 1.05)
     lifted = np.ptp(ran.rollout.position[[0, -1], 3:, 1], axis=0)
     yield ran.most("plates too high or low", np.abs(lifted - DROP).max(), 1e-4, "m")
     for name, cuts in (("its own key", CUTS), ("another key", CUTS[::-1])):
-        with TemporaryDirectory() as folder:
-            built = lock(Files(folder), cuts)
+        with Files() as mesh:
+            built = lock(mesh, cuts)
             motor = {"speed": 3.0, "max_force": 0.02}
             built.join("hand", "hinge", "key", axis=(0, 0, 1), anchor=(0, 0, 0), motor=motor)
             ran = run_built(at, name, built, 0.5)
@@ -446,8 +442,7 @@ def puzzles(at: Setting) -> Iterator[Check]:
     meshes = [blocks(cells[np.array(owner) == k], size, gap) for k in range(6)]
     for way in ([1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0, 1, 1]):
         built = SceneBuilder(gravity=(G * np.array(way) / np.linalg.norm(way)).tolist())
-        with TemporaryDirectory() as folder:
-            mesh = Files(folder)
+        with Files() as mesh:
             for k, one in enumerate(meshes):
                 keys: dict[str, Any] = {"motion": "static"} if k == 1 else {"mass": 0.02}
                 built.add(f"stick{k}", mesh=mesh(f"stick{k}", one), friction=0.5, restitution=0, **keys)

@@ -7,12 +7,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sdfsim.evaluation.instruments import DEEP
-from sdfsim.evaluation.laws.check import Check, most
 from sdfsim.evaluation.laws.scenes import (
     FACETS,
     LEG,
     STILL,
     UNIT,
+    Check,
     G,
     Put,
     Ran,
@@ -20,6 +20,7 @@ from sdfsim.evaluation.laws.scenes import (
     about,
     fixed,
     floor,
+    most,
     run,
     solid,
 )

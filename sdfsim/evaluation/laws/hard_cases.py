@@ -20,8 +20,7 @@ from sdfsim.base.files import visible
 from sdfsim.data.scenarios import steady_faces
 from sdfsim.evaluation.engines import Ran
 from sdfsim.evaluation.instruments import depths
-from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import Law, Setting
+from sdfsim.evaluation.laws.scenes import Check, Law, Setting
 from sdfsim.evaluation.metrics import energy
 from sdfsim.geometry.mesh_io import MESH_SUFFIXES
 from sdfsim.geometry.primitives import BOWL_WALL, bowl_radii

@@ -9,8 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq, fsolve
 from scipy.special import ellipk
 
-from sdfsim.evaluation.laws.check import Check
-from sdfsim.evaluation.laws.scenes import G, Ran, Setting, run_built
+from sdfsim.evaluation.laws.scenes import Check, G, Ran, Setting, run_built
 from sdfsim.scene.builder import SceneBuilder
 
 ABOUT_Z: dict[str, Any] = {"axis": (0, 0, 1)}

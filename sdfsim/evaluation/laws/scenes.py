@@ -1,4 +1,4 @@
-"""Scenes of bodies in units of their size, and what is measured on their motions.
+"""Scenes of bodies in units of their size, what is measured on their motions, and checks: in what range it should be.
 
 Lengths are in units of the size, times and speeds as at 10 cm (they scale by Froude's law). Everything is judged by
 closed forms and by `sdfsim.evaluation.instruments`, never by values of the contact solve.
@@ -7,7 +7,7 @@ closed forms and by `sdfsim.evaluation.instruments`, never by values of the cont
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from math import cos, pi, radians, sin, sqrt
+from math import cos, inf, pi, radians, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from sdfsim.evaluation import engines
 from sdfsim.evaluation.engines import Runner, by_model
 from sdfsim.evaluation.instruments import DEEP, MADE, Verdict, energies, judged, placed, solid_of
-from sdfsim.evaluation.laws.check import Check, most, near
 from sdfsim.evaluation.true_surfaces import gaps
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, convex_hull, joined
@@ -33,6 +32,44 @@ DENSITY = 500.0  # kg/m^3
 JUDGED = 60  # frames of a run, evenly spaced, in which surfaces are measured
 FACETS = 48  # number of facets of round meshes, by default
 STILL = Rotation.identity()
+
+
+@dataclass(frozen=True)
+class Check:
+    """A measured number, and the range in which it should be."""
+
+    name: str
+    measured: float
+    low: float = -inf
+    high: float = inf
+    unit: str = ""
+    digits: int = 2  # decimals shown in reports; smaller differences do not count
+    better: int = -1  # -1: lower is better, 1: higher is better, 0: it only informs, such as the height of a rebound
+    worst: bool = False  # the largest of several repetitions counts, not the mean
+
+    @property
+    def holds(self) -> bool:
+        return bool(self.low <= self.measured <= self.high)
+
+    @property
+    def wanted(self) -> str:
+        if self.low == -inf:
+            return "" if self.high == inf else f"at most {self.high:.6g}"
+        return f"at least {self.low:.6g}" if self.high == inf else f"{self.low:.6g} to {self.high:.6g}"
+
+    def __str__(self) -> str:
+        wanted = f" (wanted {self.wanted})" if self.wanted else ""
+        return f"{'ok  ' if self.holds else 'FAIL'} {self.name}: {self.measured:.6g} {self.unit}{wanted}"
+
+
+def near(name: str, measured: float, wanted: float, part: float, unit: str = "", slack: float = 0.0) -> Check:
+    """A check within a `part` of the wanted value, plus `slack`."""
+    off = abs(wanted) * part + slack
+    return Check(name, float(measured), wanted - off, wanted + off, unit)
+
+
+def most(name: str, measured: float, limit: float, unit: str = "") -> Check:
+    return Check(name, float(measured), high=limit, unit=unit)
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,10 @@ from itertools import product
 from typing import NamedTuple
 
 from sdfsim.evaluation.laws.assembly import ASSEMBLY
-from sdfsim.evaluation.laws.check import Check
 from sdfsim.evaluation.laws.everyday import EVERYDAY
 from sdfsim.evaluation.laws.hard_cases import hard_cases
 from sdfsim.evaluation.laws.joints import JOINTS
-from sdfsim.evaluation.laws.scenes import KINDS, SIZES, Law, Setting
+from sdfsim.evaluation.laws.scenes import KINDS, SIZES, Check, Law, Setting
 from sdfsim.evaluation.laws.textbook import TEXTBOOK
 from sdfsim.shape.shape import Shape
 

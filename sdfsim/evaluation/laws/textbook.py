@@ -8,8 +8,22 @@ import numpy as np
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from sdfsim.evaluation.laws.check import Check, most, near
-from sdfsim.evaluation.laws.scenes import DENSITY, STILL, UNIT, G, Put, Setting, about, floor, run, run_built, solid
+from sdfsim.evaluation.laws.scenes import (
+    DENSITY,
+    STILL,
+    UNIT,
+    Check,
+    G,
+    Put,
+    Setting,
+    about,
+    floor,
+    most,
+    near,
+    run,
+    run_built,
+    solid,
+)
 from sdfsim.geometry.primitives import revolve
 from sdfsim.scene.builder import SceneBuilder
 from sdfsim.shape.make import mesh_shape
