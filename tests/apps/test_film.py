@@ -18,7 +18,7 @@ from sdfsim import Camera, Simulator
 from sdfsim.apps.film.camera import Points, of_points, read_points
 from sdfsim.apps.film.drawing import Look, _covered
 from sdfsim.apps.film.eye import Eye
-from sdfsim.apps.film.film import identify_clips, watched, with_moving
+from sdfsim.apps.film.film import identify_clips, settled, watched, with_moving
 from sdfsim.apps.film.frames import read_clip, true_times
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.identify.report import write_scene
@@ -26,7 +26,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
-from tests.helpers.clips import GRAVITY, bouncing, filmed, of_rollout
+from tests.helpers.clips import GRAVITY, SKIN, bouncing, filmed, of_rollout
 
 CAMERA = Camera((1.2, -1.6, 0.6), look_at=(0, 0, 0.3), fov=40, width=320, height=240)
 PLACES = np.array([[-0.4, -0.3, 0], [0.4, -0.3, 0], [0.4, 0.3, 0], [-0.4, 0.3, 0], [0, 0, 0], [-0.3, 0.2, 0.25]])
@@ -504,3 +504,91 @@ def test_a_mesh_covers_what_rays_hit(tmp_path):
     assert np.abs(found - wanted).max() < 0.3  # 16 places in a pixel
     assert np.abs(found - wanted).mean() < 0.01
     assert found.sum() == pytest.approx(wanted.sum(), rel=0.005)
+
+
+def cup_file(folder: Path) -> str:
+    import trimesh
+
+    profile = np.array([(0, 0), (0.034, 0), (0.042, 0.1), (0.038, 0.1), (0.03, 0.004), (0, 0.004)])
+    trimesh.creation.revolve(profile, sections=64).export(folder / "cup.obj")
+    return str(folder / "cup.obj")
+
+
+def prism_file(folder: Path, sides: int) -> str:
+    import trimesh
+
+    trimesh.creation.cylinder(0.05, 0.12, sections=sides).export(folder / f"{sides}.obj")
+    return str(folder / f"{sides}.obj")
+
+
+def look_of(**shape: object) -> Look:
+    scene = sdfsim.Scene(model="solver").add("floor", plane={}).add("thing", mass=0.3, **shape).load()
+    return Look(scene, scene.bodies[1])
+
+
+def test_only_what_is_round_looks_alike_when_it_is_turned_about_an_axis(tmp_path):
+    long = {"radius": 0.03, "height": 0.1}
+    for shape in (
+        {"mesh": cup_file(tmp_path)},
+        {"cylinder": long},
+        {"capsule": long},
+        {"mesh": prism_file(tmp_path, 48)},
+    ):
+        look = look_of(**shape)
+        assert look.ways == 5
+        assert np.abs(look.axis) == pytest.approx([0, 0, 1], abs=1e-3)
+    for shape in (
+        {"box": {"size": [0.1, 0.1, 0.1]}},
+        {"box": {"size": [0.1, 0.1, 0.2]}},
+        {"mesh": prism_file(tmp_path, 6)},
+    ):
+        assert look_of(**shape).ways == 6
+    assert look_of(sphere={"radius": 0.1}).ways == 3
+
+
+def test_a_mesh_of_a_ball_is_lit_as_a_ball(tmp_path):
+    """Brightness in the direction of any light, from normals of faces and from those of a sphere."""
+    import trimesh
+
+    trimesh.creation.icosphere(4, 0.1).export(tmp_path / "ball.obj")
+    place, turn = np.array([0.03, 0.0, 0.1]), np.array(LEVEL)
+    ball, mesh = look_of(sphere={"radius": 0.1}), look_of(mesh=str(tmp_path / "ball.obj"))
+    at = ball.window(NEAR_EYE, place, turn, 4.0)
+    one, other = ball.patterns(NEAR_EYE, place, turn, at), mesh.patterns(NEAR_EYE, place, turn, at)
+    inside = one[0] == 1.0
+    assert np.linalg.norm(one[1:, inside], axis=0) == pytest.approx(1.0, abs=1e-3)
+    flat = other[: mesh.parts].sum(0)
+    assert np.abs(one[0] - flat).max() < 0.15
+    assert np.abs(one[1:] - other[mesh.parts :])[:, inside].max() < 0.06
+
+
+@pytest.mark.slow
+def test_a_hand_of_the_cups_colour_is_not_the_cup(tmp_path):
+    """It hides a cup that slides, whose turns about its axis nothing shows, for the first tenth of a second."""
+    friction, speed = 0.35, 1.8
+    scene = sdfsim.Scene(model="solver").add("floor", plane={}, friction=1.0, restitution=1.0)
+    scene.add("cup", mesh=cup_file(tmp_path), position=[-0.35, 0, 0], mass=0.3, color=SKIN.tolist())
+    high = float(scene.load().shapes[1].com[2])
+
+    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
+        t = min(time, speed / (friction * GRAVITY))
+        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, high]
+        return np.array([[0, 0, 0], place]), np.array([LEVEL, LEVEL])
+
+    (x, y), camera = NEARBY.project(motion(0.0)[0][1:])[0][0], NEARBY
+
+    def hand(time: float) -> np.ndarray:
+        low = y + 30 - 900 * max(0.0, time - 0.05)
+        return np.array([x - 25, low - 70, x + 40, low])
+
+    clip = filmed(tmp_path / "clip.mp4", scene.load(), motion, camera, 1.0, 60, subframes=2, hand=hand)
+    points = write_points(tmp_path / "points.yaml", camera)
+    film = watched(clip, scene.load(), points=points)
+    track, time = film.tracks[0], film.clip.time - film.clip.time[0]
+    found = film.eye.project(np.stack([track.at(k).place for k in track.frames]))
+    true = camera.project(np.stack([motion(time[k])[0][1] for k in track.frames]))[0]
+    assert len(track.frames) > 45
+    assert np.linalg.norm(found - true, axis=1).max() < 1.0
+    _, fit = settled([film])
+    value = {(e.kind, e.name): e for e in fit.shown().estimates}["friction", "cup / floor"]
+    assert value.value == pytest.approx(friction, abs=0.03)
