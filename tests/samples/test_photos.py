@@ -2,7 +2,6 @@
 
 import importlib.util
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +9,9 @@ import pytest
 import yaml
 
 from benchmarks.reconstruct import BALL, PHOTOS, drawn, dropped_ball
+from samples.photos import make
 from sdfsim.scene.load import load_scene
 from sdfsim.shape.make import analytic_shape
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "samples" / "photos"))
-import make
 
 SHAPES = Path(__file__).parents[2] / "samples" / "shapes"
 
