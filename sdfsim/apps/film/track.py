@@ -158,9 +158,10 @@ def find(
 
     if not look.ball:  # a hand before a body looks like it, but larger
         found = [item for item in found if not _distant(eye, item[1].place, place)] or found
-    # What is seen in most frames: a hand leaves soon.
+    # As at first, or as in most frames: a hand leaves soon.
     best_of = {k: max((one for j, one in found if j == k), key=lambda one: one.score) for k, _ in found}
-    usual = np.median([_hue(one) for one in best_of.values()], 0)
+    known = [begun] if begun is not None and begun.score > GOOD else best_of.values()
+    usual = np.median([_hue(one) for one in known], 0)
     found = [item for item in found if np.abs(_hue(item[1]) - usual).max() < HUE] or found
     k, best = min(found, key=unlikely)
     if free and _twins(found, look):
