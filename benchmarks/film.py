@@ -68,17 +68,13 @@ def sliding(
     rng: np.random.Generator, folder: Path, shape: dict[str, Any], up: float, upright: bool = False
 ) -> dict[str, Any]:
     """A body, whose centre is at `up` m when it lies, slides to a halt."""
-    from tests.helpers.clips import GRAVITY, filmed
+    from tests.helpers.clips import GRAVITY, filmed, slid
 
     friction, length = rng.uniform(0.15, 0.6), rng.uniform(0.4, 0.6)
     speed = np.sqrt(2 * friction * GRAVITY * length)
     turn = Rotation.from_rotvec([0, 0, 0.0 if upright else rng.uniform(0, 3)]).as_quat()
 
-    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
-        t = min(time, speed / (friction * GRAVITY))
-        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, up]
-        return np.array([[0, 0, 0], place]), np.array([[0, 0, 0, 1.0], turn])
-
+    motion = slid([-0.35, 0, up], speed, friction, turn.tolist())
     scene = SceneBuilder(model="solver").add("floor", plane={}, friction=1.0, restitution=1.0)
     color = rng.integers(30, 220, 3).tolist()
     scene.add("thing", position=[-0.35, 0, up], quat_xyzw=turn, mass=0.3, color=color, **shape)

@@ -26,7 +26,7 @@ from sdfsim.base.errors import SdfsimError
 from sdfsim.geometry.bvh import Caster
 from sdfsim.geometry.mesh import Mesh
 from sdfsim.scene.scene import Scene
-from tests.helpers.clips import GRAVITY, SKIN, bouncing, filmed, of_rollout
+from tests.helpers.clips import SKIN, bouncing, filmed, of_rollout, slid
 
 CAMERA = Camera((1.2, -1.6, 0.6), look_at=(0, 0, 0.3), fov=40, width=320, height=240)
 PLACES = np.array([[-0.4, -0.3, 0], [0.4, -0.3, 0], [0.4, 0.3, 0], [-0.4, 0.3, 0], [0, 0, 0], [-0.3, 0.2, 0.25]])
@@ -93,21 +93,15 @@ def test_poses_of_a_ball_are_exact(bounces, tmp_path):
 @pytest.mark.slow
 def test_a_box_that_slides_shows_its_friction(tmp_path):
     friction, speed = 0.35, 1.6
-    turn = Rotation.from_rotvec([0, 0, 0.4]).as_quat()
-
-    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
-        t = min(time, speed / (friction * GRAVITY))
-        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, 0.03]
-        return np.array([[0, 0, 0], place]), np.array([LEVEL, turn])
-
+    motion = slid([-0.35, 0, 0.03], speed, friction, Rotation.from_rotvec([0, 0, 0.4]).as_quat())
     camera = Camera((0.5, -1.1, 0.6), look_at=(0, 0, 0), fov=45, width=320, height=240)
     scene = box_scene().load()
     clip = filmed(tmp_path / "clip.mp4", scene, motion, camera, 1.0, 30, subframes=2)
     found = identify_clips([clip], scene, points=write_points(tmp_path / "points.yaml", camera))
     value = {(e.kind, e.name): e for e in found.estimates}
-    slid = value["friction", "box / floor"]
-    assert slid.value == pytest.approx(friction, abs=0.03)
-    assert slid.interval[0] < friction < slid.interval[1]
+    shown = value["friction", "box / floor"]
+    assert shown.value == pytest.approx(friction, abs=0.03)
+    assert shown.interval[0] < friction < slid.interval[1]
     assert value["restitution", "box / floor"].value is None
 
 
@@ -291,8 +285,8 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
     scene = sdfsim.load_scene(tmp_path / "scene.yaml")
 
     found = identify_clips([clip], scene, points=tmp_path / "points.yaml", bodies=["plank"])
-    slid = next(e for e in found.estimates if (e.kind, e.name) == ("friction", "cube / plank"))
-    assert slid.value == pytest.approx(FRICTION, abs=0.03)
+    shown = next(e for e in found.estimates if (e.kind, e.name) == ("friction", "cube / plank"))
+    assert shown.value == pytest.approx(FRICTION, abs=0.03)
     write_scene(found, tmp_path / "scene.yaml", tmp_path / "identified.yaml")
     again = sdfsim.load_scene(tmp_path / "identified.yaml")
     plank = next(b for b in again.bodies if b.name == "plank")
@@ -568,13 +562,7 @@ def test_a_hand_of_the_cups_colour_is_not_the_cup(tmp_path):
     friction, speed = 0.35, 1.8
     scene = sdfsim.Scene(model="solver").add("floor", plane={}, friction=1.0, restitution=1.0)
     scene.add("cup", mesh=cup_file(tmp_path), position=[-0.35, 0, 0], mass=0.3, color=SKIN.tolist())
-    high = float(scene.load().shapes[1].com[2])
-
-    def motion(time: float) -> tuple[np.ndarray, np.ndarray]:
-        t = min(time, speed / (friction * GRAVITY))
-        place = [-0.35 + speed * t - 0.5 * friction * GRAVITY * t**2, 0, high]
-        return np.array([[0, 0, 0], place]), np.array([LEVEL, LEVEL])
-
+    motion = slid([-0.35, 0, float(scene.load().shapes[1].com[2])], speed, friction, LEVEL)
     (x, y), camera = NEARBY.project(motion(0.0)[0][1:])[0][0], NEARBY
 
     def hand(time: float) -> np.ndarray:

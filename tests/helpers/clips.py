@@ -54,6 +54,17 @@ def bouncing(
     return at
 
 
+def slid(start: Sequence[float], speed: float, friction: float, turn: Sequence[float]) -> Motion:
+    """Body 1 of two, which slides along x to a halt, without turning."""
+
+    def at(time: float) -> tuple[np.ndarray, np.ndarray]:
+        t = min(time, speed / (friction * GRAVITY))
+        place = np.array([start[0] + speed * t - 0.5 * friction * GRAVITY * t**2, *start[1:]])
+        return np.array([np.zeros(3), place]), np.array([[0.0, 0.0, 0.0, 1.0], turn])
+
+    return at
+
+
 def filmed(
     path: Path, scene: Scene, motion: Motion, camera: Camera, seconds: float, fps: float, *, exposure: float = 0.5,
     noise: float = 2.0, flicker: float = 0.0, hand: Callable[[float], np.ndarray | None] | None = None,
