@@ -101,7 +101,7 @@ def test_a_box_that_slides_shows_its_friction(tmp_path):
     value = {(e.kind, e.name): e for e in found.estimates}
     shown = value["friction", "box / floor"]
     assert shown.value == pytest.approx(friction, abs=0.03)
-    assert shown.interval[0] < friction < slid.interval[1]
+    assert shown.interval[0] < friction < shown.interval[1]
     assert value["restitution", "box / floor"].value is None
 
 

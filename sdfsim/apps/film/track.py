@@ -260,8 +260,10 @@ def _next(clip, look, eye, shutter, frame, at, before, first, gravity) -> Seen |
         # All predictions are tried: where pictures show depth and tilt badly, one alone leads from wrong to worse.
         if best is not None and best.score > GOOD and n >= len(likely):
             break
-        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5 if wide else 10, wide=wide,
-                     turned=not wide)  # fmt: skip
+        # Where it is first: a body that is in a wrong place is turned to cover the picture.
+        one = fitted(look, eye, frame, place, turn, flow, shutter.spread, color, rounds=5, wide=wide, turned=False)
+        if one is not None and not wide and not look.ball:
+            one = fitted(look, eye, frame, one.place, turn, flow, shutter.spread, color, rounds=10)
         if one is not None and wide and one.score > max(POOR, best.score if best else 0.0):
             one = fitted(look, eye, frame, one.place, one.turn, flow, shutter.spread, color)
         if one is None or _repainted(look, one, first):
