@@ -104,7 +104,7 @@ FAULTS = (
         "bounce > 0.0 and abs(approach) > rules.slow",
         "bounce > 0.0 and abs(approach) > 100.0 * rules.slow",
     ),
-    fault("there is one sweep only", "world.py", "elastic", "rounds: int = ROUNDS", "rounds: int = 1"),
+    fault("there is one sweep only", "tolerances.py", "elastic", "rounds: int = ROUNDS", "rounds: int = 1"),
     fault(
         "a fifth of gravity is missing",
         "advance.py",

@@ -13,10 +13,10 @@ from numba.typed.typedlist import List
 
 from sdfsim.base.compiling import cache_of, kept
 from sdfsim.physics.solver.code_cache import sources
-from sdfsim.physics.solver.prepare import TOUCHING
 from sdfsim.physics.solver.references import Reference
 from sdfsim.physics.solver.run import Script, run_steps
 from sdfsim.physics.solver.survey import touching
+from sdfsim.physics.solver.tolerances import REPORTED
 from sdfsim.physics.solver.vectors import BARE, ENTRY, FAST
 from sdfsim.physics.solver.world import COLUMNS, POINTS, Manifolds
 
@@ -112,7 +112,7 @@ with kept(cache_of([*sources(), Path(__file__)])):
             part = Script(script.body, script.pose[k : k + steps], script.velocity[k : k + steps])
             manifolds, _, _, broken, _, _, _, _, _ = run_steps(
                 nth(shapes, 0), nth(worlds, w), nth(works, w), motion, rules, manifolds, nth(joints, w), pieces, part,
-                most, kept, TOUCHING, steps,
+                most, kept, REPORTED, steps,
             )  # fmt: skip
             if broken >= 0:
                 told.failed[w] = True
@@ -125,7 +125,7 @@ with kept(cache_of([*sources(), Path(__file__)])):
             held[w] = manifolds
             told.number[w] += steps
             told.force[w] = 0.0
-            found = touching(manifolds, motion.position, motion.orientation, TOUCHING)
+            found = touching(manifolds, motion.position, motion.orientation, REPORTED)
             for e in range(len(found.pair)):
                 for x in range(3):
                     told.force[w, found.pair[e, 0], x] += found.impulse[e, x]

@@ -747,7 +747,8 @@ def run_all(
 ) -> list[Rollout]:  # fmt: skip
     """`run` of a `Simulator` for every scene, made with these options, on all cores: in threads if the steps are
     compiled code that does not need Python and has no threads of its own, else in processes. Raises as these do."""
-    from sdfsim.physics.solver.prepare import CROWD, SharedShapes  # numba is slow to load
+    from sdfsim.physics.solver.prepare import SharedShapes  # numba is slow to load
+    from sdfsim.physics.solver.tolerances import CROWD
 
     model = model or load_model()
     few = all(sum(b.motion == "dynamic" for b in scene.bodies) < CROWD for scene in scenes)

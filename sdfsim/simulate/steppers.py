@@ -208,12 +208,13 @@ class OnBodies(Stepper):
 
     def _step(self, state: State, carry: Carry) -> State:
         from sdfsim.learned.inference import doubled, stepped
-        from sdfsim.physics.solver.prepare import TOUCHING, points_near
+        from sdfsim.physics.solver.prepare import points_near
+        from sdfsim.physics.solver.tolerances import REPORTED
 
         bodies, options, free = carry.bodies, carry.options, super()._step(state, carry)
         with carry.timed("contact_ms"):
             pair, value = points_near(cast("Compiled", carry.scene), state, options)
-        touch = (value[:, 9] <= TOUCHING) & (value[:, 10] == 0.0)
+        touch = (value[:, 9] <= REPORTED) & (value[:, 10] == 0.0)
         point = state.rows_of("position", pair[touch, 0]) + value[touch, :3]
         carry.touched = point, pair[touch], float((-value[touch, 9]).max(initial=0.0))
         if not len(pair):

@@ -86,3 +86,7 @@ def test_each_fault_replaces_what_is_there_once_and_names_laws_of_the_table():
         for right, wrong in one.edits:
             assert text.count(right) == 1 and right != wrong, one.name
         assert set(one.laws.split()) <= known, one.name
+
+
+def test_all_tolerances_of_the_compiled_step_have_names():
+    assert not [*runpy.run_path(str(ROOT / "scripts" / "kernel_numbers.py"))["unnamed"]()]

@@ -21,17 +21,25 @@ from sdfsim.physics.solver.convex import (
     outermost,
     rounding,
 )
+from sdfsim.physics.solver.tolerances import (
+    BETWEEN_CORNERS,
+    BETWEEN_GAPS,
+    BULGE,
+    EDGES_ASIDE,
+    EDGES_LEVEL,
+    EQUALLY_DEEP,
+    IN_FACE,
+    LEVEL_END,
+    NO_AREA,
+    ONE_POINT,
+    SAME_LENGTH,
+    STEEP,
+)
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, get, put, scale, sub, turn, turn_back
 
 RIM = 24  # points on the circle of the end of a drum or cone that bound its contact
 MOST = 160  # largest number of corners of a clipped face
 CHOSEN = 4  # largest number of them that carry the contact
-STEEP = 0.1  # cosine between a face's normal and the contact's, below which the face does not bound the contact
-LEVEL = 1e-3  # slope of a drum's end relative to the normal, below which its circle is cut at fixed points
-ASIDE = 0.002  # relative to the thickness: edges touch along their length if they are no farther aside
-TIED = 1e-4  # relative to the thickness: points whose depths differ by less count as equally deep
-BULGE = 0.05  # relative to a small face: how far a circle may bulge beyond the points on it that bound the face
-CLOSE = 1e-4  # relative to the contact's extent: nearer points are one
 
 
 class Polygons(NamedTuple):
@@ -110,7 +118,7 @@ def feature(convex, p, size, matrix, body, d, out):
         put(out, 0, turn(matrix, body, (size * a * x, size * a * y, -size * b)))
         put(out, 1, turn(matrix, body, (size * top * x, size * top * y, size * b)))
         return 2, d
-    if across < LEVEL:
+    if across < LEVEL_END:
         x, y = 1.0, 0.0
     end = math.copysign(1.0, local[2])
     for i in range(RIM):
@@ -183,7 +191,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
                 room.clipped[i, 2] = _height(room.first, m, n, u, w, x, y)
                 room.gap[i] = room.clipped[i, 2] - mine - theirs - h
         elif first == 2 and second == 2:
-            count = _common(room, mine + theirs, ASIDE * thick)
+            count = _common(room, mine + theirs, EDGES_ASIDE * thick)
     least, kept = math.inf, 0
     for i in range(count):
         if room.gap[i] <= reach:
@@ -193,7 +201,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
             kept += 1
     count = kept
     extent = _extent(room, count)
-    if not held and least > gap + 1e-6 * extent + 1e-9 * abs(gap):
+    if not held and least > gap + BETWEEN_CORNERS * extent + BETWEEN_GAPS * abs(gap):
         # Corners or edges meet between the corners of the clipped polygon.
         at = along(own, n, mine)
         put(room.clipped, count, (dot(at, u), dot(at, w), dot(at, n)))
@@ -201,7 +209,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
         count += 1
         extent = _extent(room, count)
     arm = _arm(room, count, least, extent)
-    picked = _pick(room, count, extent, least + TIED * thick)
+    picked = _pick(room, count, extent, least + EQUALLY_DEEP * thick)
     if picked > 1 and arm > 0.0:
         arm = _shrink(room, picked, arm)
     for i in range(count):
@@ -317,7 +325,7 @@ def _common(room, round_off, aside):
     px, py = second[0, 0] - first[0, 0], second[0, 1] - first[0, 1]
     off = (dx * py - dy * px) / long
     slope = (dx * ey - dy * ex) / long / (end - start)
-    if abs(slope) * (high - low) > 1e-12 * long:
+    if abs(slope) * (high - low) > EDGES_LEVEL * long:
         one, two = start + (-aside - off) / slope, start + (aside - off) / slope
         low, high = max(low, min(one, two)), min(high, max(one, two))
     elif abs(off) > aside:
@@ -361,10 +369,10 @@ def _pick(room, count, extent, deep):
             best, outer = i, place
     room.picked[0] = best
     ax, ay = room.clipped[best, 0], room.clipped[best, 1]
-    far, most = -1, (CLOSE * extent) ** 2
+    far, most = -1, (ONE_POINT * extent) ** 2
     for i in range(count):
         away = (room.clipped[i, 0] - ax) ** 2 + (room.clipped[i, 1] - ay) ** 2
-        if away > most * (1.0 + 1e-9):
+        if away > most * (1.0 + SAME_LENGTH):
             far, most = i, away
     if far < 0:
         return 1
@@ -372,12 +380,12 @@ def _pick(room, count, extent, deep):
     dx, dy = room.clipped[far, 0] - ax, room.clipped[far, 1] - ay
     long = math.sqrt(dx * dx + dy * dy)
     left = right = -1
-    over = under = CLOSE * extent
+    over = under = ONE_POINT * extent
     for i in range(count):
         side = (dx * (room.clipped[i, 1] - ay) - dy * (room.clipped[i, 0] - ax)) / long
-        if side > over * (1.0 + 1e-9):
+        if side > over * (1.0 + SAME_LENGTH):
             left, over = i, side
-        if -side > under * (1.0 + 1e-9):
+        if -side > under * (1.0 + SAME_LENGTH):
             right, under = i, -side
     kept = 2
     for i in (left, right):
@@ -390,7 +398,7 @@ def _pick(room, count, extent, deep):
 @njit(**BARE)
 def _arm(room, count, least, extent):
     """The mean distance of the points of a face or an edge from its middle; 0 for a single point."""
-    within = least + 1e-3 * extent
+    within = least + IN_FACE * extent
     kept = 0
     for i in range(count):
         if room.gap[i] <= within:
@@ -407,7 +415,7 @@ def _arm(room, count, least, extent):
         area += part
         mx += part * (x + p) / 3.0
         my += part * (y + q) / 3.0
-    if abs(area) < 1e-6 * extent * extent:
+    if abs(area) < NO_AREA * extent * extent:
         long = 0.0
         for i in range(1, kept):
             gone = (room.spare[i, 0] - room.spare[0, 0]) ** 2 + (room.spare[i, 1] - room.spare[0, 1]) ** 2

@@ -14,7 +14,6 @@ from sdfsim.physics.solver.rows import (
     IMPULSE,
     LINEAR,
     MASS,
-    RESOLVED,
     WANTED,
     respond,
     soften,
@@ -22,6 +21,7 @@ from sdfsim.physics.solver.rows import (
     within,
     write_point,
 )
+from sdfsim.physics.solver.tolerances import MET, NO_PULL, NO_SLIP, RESOLVED, THIN_EARLY
 from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, three, turn, vector
 from sdfsim.physics.solver.world import (
     END,
@@ -37,12 +37,6 @@ from sdfsim.physics.solver.world import (
     VOID,
     kick_of,
 )
-
-TOUCH = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when bodies in contact meet
-AT_REST = 1e-9  # squared speed: slower tangential motion has no direction
-# Bodies that approach by more than this part of their thickness in an inner step rebound before they have touched, else
-# after: thin bodies would overlap deeply.
-THIN = 0.005
 
 
 @njit(**BARE)
@@ -77,7 +71,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
         bounce = world.restitution[a] * world.restitution[b] if rules.options.restitution else 0.0
         stiff, damping = _stiffness(world, manifolds, m, a, b)
         between = sub(get(position, a), get(position, b))
-        thin = THIN * min(world.thickness[a], world.thickness[b])
+        thin = THIN_EARLY * min(world.thickness[a], world.thickness[b])
         first = count
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
@@ -94,7 +88,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             gap = point[GAP]
             way = -dot(then, n) * h
             early = way > thin
-            too_far = gap > TOUCH and ((-approach > rules.slow and not early) or gap > way)
+            too_far = gap > MET and ((-approach > rules.slow and not early) or gap > way)
             if phase == END:
                 too_far = point[NORMAL_IMPULSE] == 0.0 and (gap + h * approach > rules.slop or -approach > rules.slow)
             if stiff < math.inf:
@@ -112,7 +106,7 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = rest = 0.0
             if phase != END and stiff == math.inf:
-                if gap > TOUCH:
+                if gap > MET:
                     rest = -gap / h
                     target = target if rebounds else rest
                 else:
@@ -249,10 +243,10 @@ def _turning(free, a, b, arm, other):
 def _tangent(n, slip, gravity):
     """The first direction of friction: along the slip, else along gravity's tangential part, else any."""
     length = dot(slip, slip)
-    if length < AT_REST:
+    if length < NO_SLIP:
         slip = along(gravity, n, -dot(gravity, n))
         length = dot(slip, slip)
-        if length < 1e-6 * dot(gravity, gravity) + 1e-30:
+        if length < NO_PULL * dot(gravity, gravity) + 1e-30:
             axis = (1.0, 0.0, 0.0) if abs(n[0]) < 0.7 else (0.0, 1.0, 0.0)
             slip = cross(n, axis)
             length = dot(slip, slip)

@@ -14,6 +14,16 @@ import numpy as np
 from numba import njit
 from numba.extending import register_jitable
 
+from sdfsim.physics.solver.tolerances import (
+    ALONG_FACE,
+    AS_DEEP,
+    FEW_VERTICES,
+    GJK_EXACT,
+    GJK_ROUNDS,
+    NORMAL_ROUNDS,
+    PUT_APART,
+    TOO_NEAR,
+)
 from sdfsim.physics.solver.vectors import (
     BARE,
     INLINED,
@@ -35,15 +45,6 @@ POINT, SEGMENT, BLOCK, DRUM, HULL, CONE = range(6)
 # drum and cone: radius, half height); a ball around the piece; its thickness, the least distance of two parallel planes
 # around it.
 KIND, SIZE, BALL, THICKNESS, WIDTH = 0, 1, 4, 8, 9
-
-TOUCHING = 1e-4  # relative to the thickness: nearer solids are moved apart first, as rounding would turn their normals
-APART = 1e-3  # relative to the thickness: overlapping solids are moved this far apart
-# Cosine between a normal and that of a face, above which the face's is taken; and, relative to the thickness, the
-# difference of depth at which two normals count as equally good.
-ALONG, AS_MUCH = 1.0 - 5e-6, 1e-9
-EXACT = 1e-14  # relative precision of squared distances
-FEW = 48  # vertices that are all tested; in larger hulls the search climbs from neighbour to neighbour
-STEPS, ROUNDS = 48, 16  # largest numbers of GJK steps, and of rounds for normals
 
 
 class Convex(NamedTuple):
@@ -89,11 +90,11 @@ def outermost(convex, p, d):
     """The vertex of a hull that is farthest along d: from the best of a few, climb to neighbours that are farther."""
     first, last = convex.vertex_start[p], convex.vertex_start[p + 1]
     best, most = first, -math.inf
-    for v in range(first, last, 1 + (last - first - 1) // FEW):
+    for v in range(first, last, 1 + (last - first - 1) // FEW_VERTICES):
         reach = convex.vertex[v, 0] * d[0] + convex.vertex[v, 1] * d[1] + convex.vertex[v, 2] * d[2]
         if reach > most:
             best, most = v, reach
-    while last - first > FEW:
+    while last - first > FEW_VERTICES:
         start = best
         for e in range(convex.beside_start[start], convex.beside_start[start + 1]):
             v = convex.beside[e]
@@ -167,7 +168,7 @@ def closest(convex, matrix, pair, n, known, enough, room):
     between = _middle_to_middle(convex, matrix, pair)
     v, there = _gjk(convex, matrix, pair, pair.offset, between, room)
     length = norm(v)
-    if length > TOUCHING * thick:
+    if length > TOO_NEAR * thick:
         mine, theirs = pair.size * rounding(convex, pair.first), pair.other * rounding(convex, pair.second)
         n, length = _squared(convex, matrix, pair, scale(v, 1.0 / length), length, thick)
         return length - mine - theirs, n, along(there, n, -mine), along(sub(there, v), n, theirs)
@@ -180,7 +181,7 @@ def closest(convex, matrix, pair, n, known, enough, room):
                 continue
             start = scale(v, 1.0 / length)
         found = _least_deep(convex, matrix, pair, start, thick, enough, room)
-        if found[0] > best[0] + AS_MUCH * thick:  # of two equally good normals take the one found in fewer rounds
+        if found[0] > best[0] + AS_DEEP * thick:  # of two equally good normals take the one found in fewer rounds
             best = found
     return best
 
@@ -193,8 +194,8 @@ def _least_deep(convex, matrix, pair, n, thick, enough, room):
     s = separation(convex, matrix, pair, n)
     if s - mine - theirs > enough:
         return s - mine - theirs, n, own, his
-    for _ in range(ROUNDS):
-        shift = 0.0 if s > TOUCHING * thick else APART * thick - s
+    for _ in range(NORMAL_ROUNDS):
+        shift = 0.0 if s > TOO_NEAR * thick else PUT_APART * thick - s
         v, there = _gjk(convex, matrix, pair, along(pair.offset, n, shift), n, room)
         length = norm(v)
         if length == 0.0:
@@ -207,7 +208,7 @@ def _least_deep(convex, matrix, pair, n, thick, enough, room):
         found = separation(convex, matrix, pair, m)
         if found > s:
             n, s = m, found
-        if found <= was + 1e-9 * thick:
+        if found <= was + AS_DEEP * thick:
             break
     n, s = _squared(convex, matrix, pair, n, s, thick)
     return s - mine - theirs, n, along(own, n, -mine), along(his, n, theirs)
@@ -226,17 +227,17 @@ def _squared(convex, matrix, pair, n, s, thick):
             top = outermost(convex, p, out)
             for e in range(convex.around_start[top], convex.around_start[top + 1]):
                 face = get(convex.face, convex.around[e])
-                if dot(face, out) > ALONG:
+                if dot(face, out) > ALONG_FACE:
                     m = turn(matrix, body, scale(face, -1.0 if side == 0 else 1.0))
                     found = separation(convex, matrix, pair, m)
-                    if found >= s - AS_MUCH * thick:
+                    if found >= s - AS_DEEP * thick:
                         return m, found
         elif kind == BLOCK or kind == DRUM or kind == CONE:
-            flat = abs(z) > ALONG or (kind == BLOCK and (abs(x) > ALONG or abs(y) > ALONG))
+            flat = abs(z) > ALONG_FACE or (kind == BLOCK and (abs(x) > ALONG_FACE or abs(y) > ALONG_FACE))
             if flat:
                 m = turn(matrix, body, (float(round(x)), float(round(y)), float(round(z))))
                 found = separation(convex, matrix, pair, m)
-                if found >= s - AS_MUCH * thick:
+                if found >= s - AS_DEEP * thick:
                     return m, found
     return n, s
 
@@ -250,14 +251,14 @@ def _gjk(convex, matrix, pair, offset, v, room):
     # Along a rim corners come so close to each other that rounding finally turns v: the v with the best proven bound
     # counts.
     surely, best = -math.inf, v
-    for step in range(STEPS):
+    for step in range(GJK_ROUNDS):
         a = add(offset, farthest(convex, pair.first, pair.size, matrix, pair.a, scale(v, -1.0)))
         w = sub(a, farthest(convex, pair.second, pair.other, matrix, pair.b, v))
         if step > 0:
             proved = dot(v, w)
             if proved > surely * math.sqrt(least):
                 surely, best = proved / math.sqrt(least), v
-            if least - proved <= EXACT * least:
+            if least - proved <= GJK_EXACT * least:
                 break
             known = False
             for i in range(count):

@@ -12,13 +12,11 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.convex import Convex
+from sdfsim.physics.solver.tolerances import FIRST_FACE, GRID_CLOSE, GRID_OFF, NO_SLOPE
 from sdfsim.physics.solver.triangles import Triangles, signed
 from sdfsim.physics.solver.vectors import BARE, ENTRY, INLINED, along, dot, get, norm, put, scale
 
 PLANE, SPHERE, CAPSULE, BOX, CYLINDER, CONE, TORUS, GRID = range(8)
-TINY = 1e-12
-CLOSE = 2.0  # cells: a grid is exact enough farther from the surface
-EVEN = 1e-9  # relative to the size: on an edge of a closed form the first face gives the normal, not rounding
 
 
 # Columns of the table of shapes: kind; sizes (sphere: radius; capsule, cylinder and cone: radius and half height, for a
@@ -70,7 +68,7 @@ def distance(table, brick, sample, s, p):
     if kind == CYLINDER:
         return _cylinder(p, a, b)
     r = math.sqrt(p[0] * p[0] + p[1] * p[1])
-    cx, cy = (p[0] / r, p[1] / r) if r > TINY else (1.0, 0.0)
+    cx, cy = (p[0] / r, p[1] / r) if r > NO_SLOPE else (1.0, 0.0)
     if kind == TORUS:
         return _ball((p[0] - a * cx, p[1] - a * cy, p[2]), b)
     d, out, up = _cone(r, p[2], a, b)
@@ -90,8 +88,8 @@ def distance_alone(table, brick, sample, s, p):
 def true_distance(shapes, s, p):
     """Signed distance and unit gradient of the true surface of shape s, where p is near it."""
     d, n = distance(shapes.table, shapes.brick, shapes.sample, s, p)
-    if shapes.triangles.level[s] >= 0 and abs(d) <= CLOSE * shapes.table[s, CELL]:
-        exact, normal, _ = signed(shapes.triangles, s, p, abs(d) + 1.5 * shapes.table[s, ERROR])
+    if shapes.triangles.level[s] >= 0 and abs(d) <= GRID_CLOSE * shapes.table[s, CELL]:
+        exact, normal, _ = signed(shapes.triangles, s, p, abs(d) + GRID_OFF * shapes.table[s, ERROR])
         # Where faces cross or are missing, the nearest feature may be wrong about the side, and the grid is right.
         if exact < math.inf and (exact * d > 0.0 or abs(d) <= shapes.table[s, ERROR]):
             return exact, normal
@@ -125,7 +123,7 @@ def patch_of(table, label, s, p):
 @njit(**BARE)
 def _ball(p, radius):
     length = norm(p)
-    if length < TINY:
+    if length < NO_SLOPE:
         return -radius, (0.0, 0.0, 1.0)
     return length - radius, (p[0] / length, p[1] / length, p[2] / length)
 
@@ -137,7 +135,7 @@ def _box(p, a, b, c):
     sz = -1.0 if p[2] < 0.0 else 1.0
     x, y, z = sx * p[0] - a, sy * p[1] - b, sz * p[2] - c
     out = (max(x, 0.0), max(y, 0.0), max(z, 0.0))
-    length, even = norm(out), EVEN * (a + b + c)
+    length, even = norm(out), FIRST_FACE * (a + b + c)
     if length > even:
         return length, (sx * out[0] / length, sy * out[1] / length, sz * out[2] / length)
     if x >= y - even and x >= z - even:
@@ -150,9 +148,9 @@ def _box(p, a, b, c):
 @njit(**BARE)
 def _cylinder(p, radius, half):
     r = math.sqrt(p[0] * p[0] + p[1] * p[1])
-    cx, cy = (p[0] / r, p[1] / r) if r > TINY else (1.0, 0.0)
+    cx, cy = (p[0] / r, p[1] / r) if r > NO_SLOPE else (1.0, 0.0)
     sz = -1.0 if p[2] < 0.0 else 1.0
-    x, z, even = r - radius, sz * p[2] - half, EVEN * (radius + half)
+    x, z, even = r - radius, sz * p[2] - half, FIRST_FACE * (radius + half)
     if x > even and z > even:
         length = math.sqrt(x * x + z * z)
         return length, (cx * x / length, cy * x / length, sz * z / length)
@@ -174,7 +172,7 @@ def _cone(r, z, radius, half):
     d, e = math.sqrt(dx * dx + dz * dz), math.sqrt(ex * ex + z * z)
     if e < d:
         d, dx, dz = e, ex, z
-    return (d, dx / d, dz / d) if d > EVEN * slant else (side, cosine, sine) if side > -z else (-z, 0.0, -1.0)
+    return (d, dx / d, dz / d) if d > FIRST_FACE * slant else (side, cosine, sine) if side > -z else (-z, 0.0, -1.0)
 
 
 @njit(**INLINED)
@@ -184,7 +182,7 @@ def _grid(table, brick, sample, s, p):
     corners, part, beyond = _around(table, brick, sample, s, p)
     d, slope = _trilinear(corners, part)
     length = norm(slope)
-    normal = (0.0, 0.0, 1.0) if length < TINY else scale(slope, 1.0 / length)
+    normal = (0.0, 0.0, 1.0) if length < NO_SLOPE else scale(slope, 1.0 / length)
     far = dot(beyond, beyond)
     if far > 0.0:
         # The solid is within the box, which is convex, so it is at least this far away.

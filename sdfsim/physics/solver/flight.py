@@ -6,6 +6,7 @@ import math
 
 from numba import njit
 
+from sdfsim.physics.solver.tolerances import MOST_TURN, MOST_TURNS
 from sdfsim.physics.solver.vectors import (
     BARE,
     add,
@@ -21,8 +22,6 @@ from sdfsim.physics.solver.vectors import (
     turned_by,
     vector,
 )
-
-MOST_TURN = 0.1  # rad in one stage of torque-free rotation
 
 
 @njit(**BARE)
@@ -72,7 +71,7 @@ def torque_free(world, orientation, angular, matrix, span, trial, frame, b):
     if speed == 0.0:
         return
     momentum = turn(matrix, b, turn(world.inertia, b, turn_back(matrix, b, w)))
-    stages = max(1, math.ceil(min(speed * span, 100.0) / MOST_TURN))
+    stages = max(1, math.ceil(min(speed * span / MOST_TURN, MOST_TURNS)))
     h = span / stages
     for _ in range(stages):
         k1 = scale(w, h)

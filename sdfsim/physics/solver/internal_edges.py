@@ -15,16 +15,12 @@ from sdfsim.physics.solver.distance import KIND, PLANE
 from sdfsim.physics.solver.manifold import renewed
 from sdfsim.physics.solver.narrow_phase import SOLIDS, collide_solids, origin, pair_kind
 from sdfsim.physics.solver.surface_distance import KEYS
+from sdfsim.physics.solver.tolerances import AROUND, ASLANT, FACING, LEVEL
 from sdfsim.physics.solver.triangles import highest
 from sdfsim.physics.solver.vectors import BARE, add, dot, get, put, scale, three, turn, turn_back
 from sdfsim.physics.solver.world import FIRST, GAP, KEY, NORMAL, SECOND, VOID
 
-ASLANT = 0.9999  # cosine between a normal and that of a support, above which the two count as equal
-STEEPEST = -0.1  # cosine below which they face each other
-# slops: what rises above a support by no more than this is no wall; a contact that is deeper than this always acts
-LEVEL = 4.0
 OPEN = -1.0  # in place of 0 or 1: whether a contact is void is not known yet
-AROUND = 12.0  # slops: distance from a contact within which triangles may be its wall
 
 
 @njit(**BARE, inline="always")
@@ -126,7 +122,7 @@ def _support(shapes, world, work, motion, rules, manifolds, near, p, k, side):
             facing = dot(n, m)
             # What supports nothing itself is no support: else contacts void each other, and bodies fall through.
             void = manifolds.point[q, e, VOID] > 0.0
-            if void or facing > ASLANT or facing < STEEPEST or manifolds.point[q, e, GAP] > rules.slop:
+            if void or facing > ASLANT or facing < FACING or manifolds.point[q, e, GAP] > rules.slop:
                 continue
             # The plane of the support, and how far the other body's piece extends above it.
             ground = manifolds.pair[q, 1 - own]

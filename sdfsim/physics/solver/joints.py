@@ -56,7 +56,6 @@ from sdfsim.physics.solver.rows import (
     LINEAR,
     MASS,
     OTHER,
-    RESOLVED,
     SIDE,
     STRONGEST,
     WANTED,
@@ -70,6 +69,15 @@ from sdfsim.physics.solver.rows import (
 )
 from sdfsim.physics.solver.rows import (
     MOTOR as MOTOR_ROW,
+)
+from sdfsim.physics.solver.tolerances import (
+    LIMIT_AHEAD,
+    LIMIT_GIVES,
+    NO_LENGTH,
+    NO_SWING,
+    REPAIR,
+    RESOLVED,
+    STRETCH,
 )
 from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held, asleep, factor, substitute
 from sdfsim.physics.solver.vectors import (
@@ -90,11 +98,6 @@ from sdfsim.physics.solver.vectors import (
     vector,
 )
 from sdfsim.physics.solver.world import END, kick_of
-
-STRETCH = 1e-7  # model lengths (and rad): rows with a larger error are repaired by moving bodies
-REPAIR = 0.05  # largest repair in an inner step, model lengths (and rad)
-GIVES = 0.2  # share of an overrun limit that an inner step resolves
-AHEAD = 0.05  # model lengths (and rad): nearer limits are taken into account
 
 
 class Each(NamedTuple):
@@ -217,11 +220,11 @@ def coordinate(each, position, matrix, j):
         n = cross(a, b)
         s = norm(n)
         state[j, COORD] = math.atan2(s, dot(a, b))
-        write_turn(row, scale(n, -1.0 / s) if s > 1e-9 else (0.0, 0.0, 0.0))
+        write_turn(row, scale(n, -1.0 / s) if s > NO_SWING else (0.0, 0.0, 0.0))
     elif kind == DISTANCE:
         length = norm(way)
         state[j, COORD] = length
-        write_point(row, scale(way, 1.0 / length) if length > 1e-12 else (0.0, 0.0, 1.0), arm, other)
+        write_point(row, scale(way, 1.0 / length) if length > NO_LENGTH else (0.0, 0.0, 1.0), arm, other)
 
 
 @njit(**BARE)
@@ -493,9 +496,9 @@ def _limits(work, rules, each, rows, count, j, phase):
         if not gap < math.inf or (phase == END and state[STOP] * sign <= 0.0):
             continue
         then = sign * free
-        if gap + h * then > AHEAD and gap > AHEAD:
+        if gap + h * then > LIMIT_AHEAD and gap > LIMIT_AHEAD:
             continue
-        left = 0.0 if gap >= 0.0 else (1.0 - GIVES) * gap
+        left = 0.0 if gap >= 0.0 else (1.0 - LIMIT_GIVES) * gap
         aim = 0.0 if phase == END else (left - gap) / h
         approach = -sign * before
         if phase != END and number[BOUNCE] > 0.0 and approach > rules.slow and gap <= h * approach:

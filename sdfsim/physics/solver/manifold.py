@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from numba.extending import register_jitable
 from sdfsim.physics.solver.clipping import Polygons, polygons_room
 from sdfsim.physics.solver.convex import Simplex, simplex_room
 from sdfsim.physics.solver.distance import KIND, SIZE, SPHERE
+from sdfsim.physics.solver.tolerances import EQUAL, ONE_FACE, SAME_CORE, SAME_NORMAL, TURN_COUNTS
 from sdfsim.physics.solver.vectors import BARE, add, along, dot, get, scale, sub, turn, turn_back
 from sdfsim.physics.solver.world import (
     COLUMNS,
@@ -31,10 +33,7 @@ FOUND = 128  # contact points that may be found for a pair at once
 CANDIDATES = 256  # largest number of leaves of nodes that may touch
 SIDE = 40  # largest number of them that become points
 EACH = 4  # points of a manifold for the same two patches
-ALIKE = 0.9  # cosine between normals, above which they count as equal
-EVEN = 1e-9  # two lengths, or their squares, count as equal if they differ by less
 TOUCHES = 1e6  # more than any squared distance between points of a pair
-OUTWARD = 1e-3  # how much deeper a point must be to be preferred to one that is farther out by one length
 
 
 class Scratch(NamedTuple):
@@ -132,7 +131,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
 
     Returns their number.
     """
-    found, every, away, alike = scratch.found, scratch.every, scratch.away, scratch.alike
+    found, every = scratch.found, scratch.every
     for e in range(count):
         for x in range(COLUMNS):
             every[e, x] = found[e, x]
@@ -146,7 +145,7 @@ def merged(rules, point, p, known, scratch, count, rounded):
             for x in range(3):
                 turned += point[p, k, NORMAL + x] * found[e, NORMAL + x]
                 gone += (point[p, k, x] - found[e, x]) ** 2
-            if (gone < same and turned > 0.8) or (rounded and turned > 0.99):
+            if (gone < same and turned > SAME_NORMAL) or (rounded and turned > SAME_CORE):
                 twin = e
                 break
         if twin < 0:
@@ -157,50 +156,19 @@ def merged(rules, point, p, known, scratch, count, rounded):
             for x in range(NORMAL_IMPULSE, KEY):
                 every[twin, x] = point[p, k, x]
             every[twin, TORSION] = point[p, k, TORSION]
-    # First the deepest, then always the one farthest from those chosen; points that touch come before all others.
-    chosen, lowest = -1, 1e300
-    for e in range(total):
-        away[e], alike[e] = 1e300, 0
-        if every[e, GAP] < lowest - EVEN:
-            chosen, lowest = e, every[e, GAP]
-    kept = 0
-    while chosen >= 0 and kept < POINTS:
-        for x in range(COLUMNS):
-            point[p, kept, x] = every[chosen, x]
-        kept += 1
-        farthest, following = rules.apart * rules.apart, -1
-        for e in range(total):
-            gone = 0.0
-            turned = 0.0
-            for x in range(3):
-                gone += (every[e, x] - every[chosen, x]) ** 2
-                turned += (every[e, NORMAL + x] - every[chosen, NORMAL + x]) ** 2
-            if turned < 0.02 and every[e, KEY] == every[chosen, KEY]:
-                alike[e] += 1
-            away[e] = min(away[e], gone + 0.01 * turned)
-            # Points that carry load come first, else a body at rest would change its points when all are equally deep;
-            # then those that touch, or are about to: a corner that is far out but above is no help, and a rolling body
-            # would sink in if its next node had to wait until it touches.
-            if away[e] > rules.apart * rules.apart and alike[e] < EACH:
-                bears = every[e, NORMAL_IMPULSE] > 0.0
-                far = away[e] + (2.0 * TOUCHES if bears else TOUCHES if every[e, GAP] <= rules.slop else 0.0)
-                if far > farthest + EVEN:
-                    farthest, following = far, e
-        chosen = following
-    return kept
+    return spread(rules, scratch, total, point[p])
 
 
 @njit(**BARE)
 def renewed(rules, point, p, known, scratch, count):
     """Replace all known points of a pair by the new ones; a new point at the place of an old one takes over its
     impulses. Returns their number."""
-    found, every = scratch.found, scratch.every
+    found, every, same = scratch.found, scratch.every, rules.contact_margin * rules.contact_margin
+    if count > POINTS:
+        count = thinned(rules, scratch, count)
     for k in range(known):
         for x in range(COLUMNS):
             every[k, x] = point[p, k, x]
-    same = rules.contact_margin * rules.contact_margin
-    if count > POINTS:
-        count = thinned(scratch, count)
     for e in range(count):
         twin, least = -1, same
         for k in range(known):
@@ -212,7 +180,7 @@ def renewed(rules, point, p, known, scratch, count):
                 on_first += (every[k, FIRST + x] - found[e, FIRST + x]) ** 2
                 on_second += (every[k, SECOND + x] - found[e, SECOND + x]) ** 2
             away = min(on_first, on_second)
-            if turned > 0.8 and away < least:
+            if turned > SAME_NORMAL and away < least:
                 twin, least = k, away
         for x in range(COLUMNS):
             point[p, e, x] = found[e, x]
@@ -224,29 +192,45 @@ def renewed(rules, point, p, known, scratch, count):
 
 
 @njit(**BARE)
-def thinned(scratch, count):
-    """Choose as many points as a manifold holds: the deepest, then always the one farthest from those chosen. They are
-    moved to the front of `found`."""
-    found, away = scratch.found, scratch.away
+def thinned(rules, scratch, count):
+    """Choose as many of the new points as a manifold holds. They are moved to the front of `found`."""
     for e in range(count):
-        away[e] = 1e300
-    kept, chosen = 0, 0
-    for e in range(count):
-        if found[e, GAP] < found[chosen, GAP] - EVEN:
-            chosen = e
-    while kept < POINTS:
-        away[chosen], away[kept] = away[kept], away[chosen]
         for x in range(COLUMNS):
-            found[chosen, x], found[kept, x] = found[kept, x], found[chosen, x]
-        last = kept
+            scratch.every[e, x] = scratch.found[e, x]
+    return spread(rules, scratch, count, scratch.found)
+
+
+@njit(**BARE)
+def spread(rules, scratch, total, chosen):
+    """Write to `chosen` the deepest of the first points of `scratch.every`, then always the one farthest from those
+    chosen; points that touch come before all others. Returns their number, at most that of a manifold."""
+    every, away, alike = scratch.every, scratch.away, scratch.alike
+    best, lowest = -1, math.inf
+    for e in range(total):
+        away[e], alike[e] = math.inf, 0
+        if every[e, GAP] < lowest - EQUAL:
+            best, lowest = e, every[e, GAP]
+    kept, apart = 0, rules.apart * rules.apart
+    while best >= 0 and kept < POINTS:
+        for x in range(COLUMNS):
+            chosen[kept, x] = every[best, x]
         kept += 1
-        chosen = kept
-        for e in range(kept, count):
-            gone = 0.0
+        farthest, following = apart, -1
+        for e in range(total):
+            gone = turned = 0.0
             for x in range(3):
-                gone += (found[e, FIRST + x] - found[last, FIRST + x]) ** 2
-                gone += 0.01 * (found[e, NORMAL + x] - found[last, NORMAL + x]) ** 2
-            away[e] = min(away[e], gone)
-            if away[e] > away[chosen] + EVEN:
-                chosen = e
+                gone += (every[e, x] - every[best, x]) ** 2
+                turned += (every[e, NORMAL + x] - every[best, NORMAL + x]) ** 2
+            if turned < ONE_FACE and every[e, KEY] == every[best, KEY]:
+                alike[e] += 1
+            away[e] = min(away[e], gone + TURN_COUNTS * turned)
+            # Points that carry load come first, else a body at rest would change its points when all are equally deep;
+            # then those that touch, or are about to: a corner that is far out but above is no help, and a rolling body
+            # would sink in if its next node had to wait until it touches.
+            if away[e] > apart and alike[e] < EACH:
+                bears = every[e, NORMAL_IMPULSE] > 0.0
+                far = away[e] + (2.0 * TOUCHES if bears else TOUCHES if every[e, GAP] <= rules.slop else 0.0)
+                if far > farthest + EQUAL:
+                    farthest, following = far, e
+        best = following
     return kept

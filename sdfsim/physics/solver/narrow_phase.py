@@ -54,6 +54,7 @@ from sdfsim.physics.solver.surface_distance import (
     round_points,
     swallowed,
 )
+from sdfsim.physics.solver.tolerances import ARM_PROBES, FACE_ARM, FLAT, MANY_PAIRS
 from sdfsim.physics.solver.vectors import (
     BARE,
     FAST,
@@ -72,13 +73,7 @@ from sdfsim.physics.solver.vectors import (
 )
 from sdfsim.physics.solver.world import COLUMNS, FIRST, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TORSION
 
-MANY = 192  # number of pairs from which threads pay off, even beside other programs
 SHARES = 16  # groups of pairs, each with its own scratch, that threads take in turn
-FLAT = 0.95  # least cosine between the normals of one face
-# Mean distance of a face's points from its middle, relative to that of its corners: 0.54 for a square, 0.67 for a disc,
-# 0.5 for a bar.
-FACE = 0.58
-PROBES = 12  # probes on the way from the middle of a face to its corner
 SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is tested
 
 
@@ -179,7 +174,7 @@ def find_parts(shapes, world, work, motion, rules, parts, surfaces, threads):
     matrix, pairs, ways, reach = work.matrix, parts.pair, work.motion_bound, rules.contact_margin
     many = False
     if threads is not None:  # known at compile time
-        many = len(pairs) >= MANY
+        many = len(pairs) >= MANY_PAIRS
         if many:
             _near_many(shapes, world, motion, matrix, pairs, ways, reach, parts, surfaces)
     if not many:
@@ -310,7 +305,7 @@ def narrow_phase(shapes, world, work, motion, rules, manifolds, near, surfaces, 
     """Update all manifolds to the present poses: move or drop old points, and find new ones."""
     matrix, gone, scratch = work.matrix, work.moved, work.scratch
     if threads is not None:  # known at compile time
-        if len(near.start) >= MANY:
+        if len(near.start) >= MANY_PAIRS:
             _collide_many(shapes, world, motion, matrix, rules, manifolds, near, gone, surfaces)
             return
     _collide_some(
@@ -418,12 +413,12 @@ def _torsion_arms(shapes, world, motion, matrix, rules, manifolds, p, anew):
         if point[k, TORSION] < 1.0:
             continue
         if full:
-            point[k, TORSION] = FACE
+            point[k, TORSION] = FACE_ARM
             continue
         way = sub(_half_way(motion, matrix, point, a, b, k), middle)
         total = weights = 0.0
-        for e in range(PROBES):
-            t = (e + 0.5) / PROBES
+        for e in range(ARM_PROBES):
+            t = (e + 0.5) / ARM_PROBES
             if _both_touch(shapes, world, motion, matrix, rules, a, b, along(middle, way, t)):
                 total, weights = total + t * t, weights + t
         point[k, TORSION] = total / weights if weights > 0.0 else 1.0
@@ -492,7 +487,7 @@ def collide_solids(shapes, world, motion, matrix, rules, manifolds, near, went, 
             near.away[at] = gap + went
             if gap <= look:
                 if count + CHOSEN > FOUND:
-                    count = thinned(scratch, count)
+                    count = thinned(rules, scratch, count)
                 picked, arm = touching_points(
                     convex, matrix, pair, plane, near.held[at], gap, n, own, his, look, polygons
                 )

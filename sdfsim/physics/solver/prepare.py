@@ -18,7 +18,7 @@ from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
 from sdfsim.physics.free_flight import fly
 from sdfsim.physics.motion import MOTION, Motion
-from sdfsim.physics.options import SLOP, SLOP_A_TIME, SLOW, Options
+from sdfsim.physics.options import Options
 from sdfsim.physics.solver import distance as kinds
 from sdfsim.physics.solver import world as compiled
 from sdfsim.physics.solver.convex import BALL, BLOCK, CONE, DRUM, HULL, POINT, SEGMENT, THICKNESS, WIDTH, Convex
@@ -31,6 +31,7 @@ from sdfsim.physics.solver.references import Reference
 from sdfsim.physics.solver.rows import WIDTH as OF_ROW
 from sdfsim.physics.solver.run import Kept, Script, run_steps
 from sdfsim.physics.solver.survey import Touching, touching
+from sdfsim.physics.solver.tolerances import AGREED, CROWD, REPORTED, SIDED, SLOP, SLOP_A_TIME, SLOW, Rules
 from sdfsim.physics.solver.tree import EQUATIONS, Factors, Graph, Held
 from sdfsim.physics.solver.triangles import Triangles, signed_distances
 from sdfsim.physics.steps import COUNTS, PHASES, Frames, Steps
@@ -46,9 +47,6 @@ FORMS = {
     "cylinder": kinds.CYLINDER, "cone": kinds.CONE, "torus": kinds.TORUS,
 }  # fmt: skip
 SOLIDS = {"sphere": POINT, "capsule": SEGMENT, "box": BLOCK, "cylinder": DRUM, "cone": CONE, "hull": HULL}
-CROWD = 64  # number of dynamic bodies from which threads may test pairs
-TOUCHING = 1e-3  # model lengths: nearer points are reported as contacts
-SIDED, AGREED = 4000, 0.98  # places at which triangles and grid are compared, and the part that must be on one side
 INSTANTS = 4  # of a step, at which networks look for contacts
 NO_PARTS = Parts(
     np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros(0, np.int32),
@@ -134,7 +132,7 @@ class Compiled:
         world.inverse_inertia[:] = np.linalg.inv(bodies.inertia) * bodies.moves[:, None, None]
 
     def run(
-        self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: compiled.Rules, steps: int = 1,
+        self, motion: compiled.Motion, manifolds: compiled.Manifolds, rules: Rules, steps: int = 1,
         script: Script = NO_SCRIPT, most: np.ndarray = NO_LIMITS, *, keep: bool = False,
     ) -> tuple[Any, ...]:  # fmt: skip
         """Make `steps` steps and write to `motion`. Returns what `run_steps` does, and last the `Kept` of each step."""
@@ -146,7 +144,7 @@ class Compiled:
         )  # fmt: skip
         arguments = (self.shapes, self.world, self.work, motion, rules, manifolds, self.joints)
         # An integer of another type would cause another compilation.
-        others = script, most, kept, TOUCHING, int(steps)
+        others = script, most, kept, REPORTED, int(steps)
         if self.pieces is None:
             used = chosen(surfaces=self.surfaces, threads=self.threads, joints=joints > 0)
             self.pieces = _compiled("the contact step", run_steps, arguments, others, used)
@@ -237,7 +235,7 @@ def _compiled(what: str, function: Any, arguments: tuple, others: tuple, used: d
     return nowhere._replace(**{of: piece.address(types[of]) for of, piece in used.items()})
 
 
-def scripted(tracks: Tracks | None, time: float, rules: compiled.Rules, steps: int) -> tuple[Script, float]:
+def scripted(tracks: Tracks | None, time: float, rules: Rules, steps: int) -> tuple[Script, float]:
     """Poses and velocities of paths for `steps` steps, and the time after them. Velocities change in each inner step:
     if they jumped once a step, bodies on an accelerating tray would slip. The last is that at the end of the step."""
     inner, count = rules.substep_dt, rules.options.substeps
@@ -304,7 +302,7 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
 
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    return touching(_manifolds(state.touch), state.position, state.orientation, TOUCHING)
+    return touching(_manifolds(state.touch), state.position, state.orientation, REPORTED)
 
 
 def nodes_near(
@@ -355,10 +353,10 @@ def points_near(scene: Compiled, state: State, options: Options) -> tuple[np.nda
     return np.concatenate(pairs), np.concatenate(values)
 
 
-def compiled_rules(options: Options) -> compiled.Rules:
+def compiled_rules(options: Options) -> Rules:
     """The options of a run in the form that the compiled step needs."""
     inner = options.dt / options.substeps
-    return compiled.Rules(
+    return Rules(
         options,
         inner,
         SLOW * math.hypot(*options.gravity) * inner,

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.tolerances import LOCKED, RIGID
 from sdfsim.physics.solver.vectors import BARE, INLINED, add, along, cross, dot, scale, sub, three, turn
 from sdfsim.physics.solver.world import END, START, kick_of
 
@@ -36,10 +37,6 @@ LEFT, SIDE = range(2)
 # Motors: the speed to reach; the largest impulses of the motor and of friction. Friction of balls has its largest
 # impulse in the same column.
 AIM, STRONGEST, DRAG = range(3)
-LOCKED = 1e-9  # relative to its joints alone: a coupling with less effect can move nothing
-# (Phase of a spring in an inner step)^2 up to which it is not damped: ten inner steps a period.
-RESOLVED = 0.4
-RIGID = 1e-9  # least impulse of a spring for a unit of speed, relative to the row's effective mass
 
 
 class Rows(NamedTuple):

@@ -41,23 +41,22 @@ from sdfsim.physics.solver.rows import (
     sweep,
     velocity_of,
 )
+from sdfsim.physics.solver.tolerances import (
+    BLOCKED,
+    BREAKS,
+    END_EXACT,
+    ENERGY_GAIN,
+    EVEN_MASSES,
+    HOLDS,
+    JOINTS_EXACT,
+    MANY_ISLANDS,
+    MOST_OFTEN,
+    TRIALS,
+)
 from sdfsim.physics.solver.tree import EQUATIONS, factor, forget_through, project, respond_through
 from sdfsim.physics.solver.vectors import BARE, FAST
 from sdfsim.physics.solver.world import END
 
-ROUNDING = 1e-4  # part of the energy with which contacts meet: an impact gains energy if it gains more
-# The larger the ratio of masses, the more slowly sweeps carry a load to lighter bodies. The number of sweeps of an
-# island is multiplied by its ratio divided by the first number, at most by the second.
-EVEN, OFTEN = 30.0, 30.0
-MANY = 64  # number of islands from which threads pay off
-HOLDS = 1e-11  # model lengths (and rad): rows of joints need not hold more exactly
-TRIALS = 6  # rounds of the search for impulses after which rows hold
-BREAKS = 4  # rounds in which joints may break in one inner step
-EXACT = 0.01  # relative to the precision to which contacts without joints are solved
-AT_END = 0.1  # likewise at the end of a step, whose velocities users see
-# Relative to its effect without joints: if the effect of a bounded row is less, joints allow no motion along it, and
-# what is left is rounding. The joints then bear all of it.
-BLOCKED = 1e-7
 DENSE = 240  # largest number of bounded rows of an island for which all effects through the joints are stored
 PER_JOINT = 4  # largest number of bounded rows of a joint
 
@@ -90,7 +89,7 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
     )  # fmt: skip
     written, islands, many = reference(rows), len(start) - 1, False
     if threads is not None and joints is None:  # known when it is compiled
-        many = islands >= MANY
+        many = islands >= MANY_ISLANDS
         if many:
             _solve_many(world, work, motion, rules, written, phase)
     if not many:
@@ -162,7 +161,7 @@ def _solve_rows(world, work, motion, rules, rows, joints, delassus, island, phas
 def _keep_energy(world, work, motion, rules, rows, joints, delassus, island, rounds, phase):
     lo, hi, change = rows.start[island], rows.start[island + 1], work.change
     gain, brought = _gain(rows, change, lo, hi)
-    if gain <= ROUNDING * brought:
+    if gain <= ENERGY_GAIN * brought:
         return
     for i in range(lo, hi):
         c = rows.order[i]
@@ -218,7 +217,7 @@ def _sweeps(mass, rules, rows, island):
             inverse = mass[rows.where[rows.order[i], x]]
             if inverse > 0.0:
                 heaviest, lightest = min(heaviest, inverse), max(lightest, inverse)
-    return np.int64(rules.rounds * min(max(lightest / (EVEN * heaviest), 1.0), OFTEN))
+    return np.int64(rules.rounds * min(max(lightest / (EVEN_MASSES * heaviest), 1.0), MOST_OFTEN))
 
 
 @njit(**BARE)
@@ -283,14 +282,14 @@ def _balance(world, work, motion, rules, rows, joints, delassus, island, rounds,
     """Relax all bounded rows until no impulse changes a velocity by more than `exact`, so that the rows of joints hold
     after the move."""
     lo, hi, mass, change = rows.start[island], rows.start[island + 1], work.inverse_mass, work.change
-    exact = rules.exact * (AT_END if phase == END else 1.0)
+    exact = rules.exact * (END_EXACT if phase == END else 1.0)
     if joints is None:
         for _ in range(rounds):
             if sweep(rows, work, None, lo, hi) <= exact:
                 break
         return
     first, last, graph, held = rows.first[island], rows.first[island + 1], joints.graph, joints.held
-    exact *= EXACT if last > first else 1.0
+    exact *= JOINTS_EXACT if last > first else 1.0
     for i in range(first, last):
         c = rows.component[i]
         for k in range(graph.comp[c], graph.comp[c + 1]):

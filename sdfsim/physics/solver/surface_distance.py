@@ -23,7 +23,37 @@ from sdfsim.physics.solver.distance import (
     patch_of,
     true_distance,
 )
-from sdfsim.physics.solver.manifold import ALIKE, CANDIDATES, FOUND, OUTWARD, SIDE, write
+from sdfsim.physics.solver.manifold import CANDIDATES, FOUND, SIDE, write
+from sdfsim.physics.solver.tolerances import (
+    ALIKE,
+    BESIDE,
+    CORE_ENDS,
+    DESCENT_ROUNDS,
+    FIRST_STRIDE,
+    GRID_FARTHER,
+    GRID_FINE,
+    LAST_STRIDE,
+    LEVEL_CIRCLE,
+    LEVEL_FACE,
+    LEVEL_SLOPE,
+    LONGER,
+    LOWER,
+    MOVED_SINCE,
+    ONTO,
+    ONTO_IT,
+    OUTWARD,
+    PROBED,
+    RESTART,
+    SHARP_REACH,
+    SHARP_ROUNDS,
+    SHARP_SHORTER,
+    SHARP_STRIDE,
+    SHORTER,
+    SHORTEST,
+    TRACE_ROUNDS,
+    TRACED_TO,
+    WITHIN,
+)
 from sdfsim.physics.solver.triangles import closest, lowest_corner
 from sdfsim.physics.solver.vectors import (
     BARE,
@@ -45,23 +75,9 @@ from sdfsim.physics.solver.vectors import (
 from sdfsim.physics.solver.world import COLUMNS, FIRST, GAP, NORMAL, NORMAL_IMPULSE, OWNER, SECOND
 
 KEYS = 1024  # largest number of patches of a shape
-ROUNDS = 12  # rounds of refinement
-NEAR = 2.0  # cells: a grid is fine within this distance of its surface
-FARTHER = 2.0  # cells: elsewhere its distance may be too large by this much, at a tip
-ONTO, BESIDE = 3, 0.05  # number of steps back onto the body's own surface, and how near, in strides, they must get
 WAYS = 8  # directions in which the outermost nodes of a face are searched
-ONTO_IT = 0.05  # cells: a point this near a surface is on it
-STRIDE, FINEST = 0.02, 5e-4  # first and last step of the refinement, relative to a body's size
-LONGER = 4.0  # a step is at most this many times the last one
-SHARPER, SHARPEST = 4, 1e-4  # rounds of refinement on triangles, and their last step, relative to a body's size
-LEVEL_FACE = 0.1  # slope below which steps along triangles are too short, and their corners are compared
-PROBED = 0.01  # cells: a body that has moved by more may have rolled over a ripple of its grid
-WITHIN = 0.5  # cells: how far the refinement on a grid may end from where triangles are nearest
-AWAY, TRACED = 1e-6, 12  # model lengths: farther points do not touch yet; and steps of a search along their way
 BEADS, FIXED = 32, 8  # points on a core at which distances are taken; and those of a whole circle that touch
 GOLDEN = 0.6180339887498949
-LEVEL = 1e-9  # relative to a circle's radius: differences of distance that show no nearest point
-SHORTEST, AHEAD = 2.5, 4.0  # first step when starting again: least multiples of the last, and of the motion since
 
 
 @njit(**BARE)
@@ -141,20 +157,20 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         if count == FOUND:
             break
         if e < 0:
-            key, stride, at, around = 0, STRIDE * size, -1, STRIDE * size
+            key, stride, at, around = 0, FIRST_STRIDE * size, -1, FIRST_STRIDE * size
             p = _foot(shapes, r, mapped(back, middle, (0.0, 0.0, half * (e + 2))))
             if abs(distance_alone(shapes.table, shapes.brick, shapes.sample, r, p)) > ONTO_IT * shapes.table[r, CELL]:
                 continue  # too far to reach the surface
             d, n = distance(shapes.table, shapes.brick, shapes.sample, s, mapped(w, c, p))
         else:
-            i, stride = scratch.pick[e], STRIDE * size
+            i, stride = scratch.pick[e], FIRST_STRIDE * size
             key, at, p = scratch.key[i], scratch.leaf[i], get(shapes.node, scratch.node[i])
             around = 2.0 * shapes.cover[scratch.node[i]]
             d, n = scratch.depth[i] / k, get(scratch.normal, i)
         found = False
         if at >= 0 and near.placed[at]:
             # Start where the last descent ended, with shorter steps, unless the node is deeper by now.
-            q, short = get(near.place, at), min(stride, max(SHORTEST * FINEST * size, AHEAD * way / own))
+            q, short = get(near.place, at), min(stride, max(RESTART * LAST_STRIDE * size, MOVED_SINCE * way / own))
             if q[0] == p[0] and q[1] == p[1] and q[2] == p[2]:
                 stride, found = short, True
             else:
@@ -164,10 +180,10 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
         # The last descent on triangles ended on the true surface: a grid would lead away from there.
         if not (sharp and found):
             p, d, n = _refined(
-                shapes.table, shapes.brick, shapes.sample, stride, FINEST * size, r, s, w, c, k, own, p, d, n
+                shapes.table, shapes.brick, shapes.sample, stride, LAST_STRIDE * size, r, s, w, c, k, own, p, d, n
             )
         if found and not sharp and way > PROBED * own * _cell(shapes, r):
-            p, d, n = _past_ripples(shapes, FINEST * size, r, s, w, c, k, own, p, d, n)
+            p, d, n = _past_ripples(shapes, LAST_STRIDE * size, r, s, w, c, k, own, p, d, n)
         if sharp:
             here = sub(scale(p, own), get(world.com, one))
             if _is_found(scratch.found, begun, count, side, here, apart):
@@ -175,7 +191,7 @@ def nodes_near(shapes, world, motion, matrix, look, a, b, side, near, pair, went
             if not found:
                 p = _onto(shapes, r, p, 2.0 * shapes.table[r, ERROR])
                 stride = apart / own
-            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARPEST * size, around)
+            p, d, n = _descended(shapes, r, s, w, c, k, own, p, stride, SHARP_STRIDE * size, around)
         if at >= 0:
             near.placed[at] = True
             put(near.place, at, p)
@@ -328,7 +344,7 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
     ratio = k / own
     _, m = distance(table, brick, sample, s, p)
     way, was = (0.0, 0.0, 0.0), 0.0  # the last step's direction, and the slope of the distance along it
-    for _ in range(ROUNDS):
+    for _ in range(DESCENT_ROUNDS):
         # The other's normal in own axes (w is a rotation times own / k), minus its component normal to the own surface.
         g = (
             (w[0][0] * n[0] + w[1][0] * n[1] + w[2][0] * n[2]) * ratio,
@@ -337,7 +353,7 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
         )
         g = along(g, m, -dot(g, m))
         slope = norm(g)
-        if slope < 0.02:
+        if slope < LEVEL_SLOPE:
             break
         # Step length: to where the slope vanishes if it continues to change as in the last step (secant), and a short
         # step at first; in powers of two, or rounding errors would grow tenfold in each step.
@@ -347,7 +363,7 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
             stride *= 2.0 ** math.floor(math.log2(longer) + 0.5)
         way, was, better = scale(g, -1.0 / slope), slope, False
         while stride > least:
-            q, share = along(p, way, stride), 0.4
+            q, share = along(p, way, stride), SHORTER
             # Back onto the own surface. Beyond an edge one step is not enough, and a point beside the surface is not
             # accepted.
             own_d, across_own = distance(table, brick, sample, s, q)
@@ -359,13 +375,13 @@ def _refined(table, brick, sample, stride, least, s, t, w, c, k, own, p, d, n):
             if abs(own_d) <= BESIDE * stride:
                 q = along(q, across_own, -own_d)
                 there, normal = distance(table, brick, sample, t, mapped(w, c, q))
-                if there < d - 1e-9:
+                if there < d - LOWER:
                     better = True
                     p, d, n, m = q, there, normal, across_own
                     break
                 # The minimum of the parabola through the slope here and the distance there.
                 fall = slope * stride / ratio
-                share = min(0.4, max(0.1, 0.5 * fall / (there - d + fall)))
+                share = min(SHORTER, max(SHORTEST, 0.5 * fall / (there - d + fall)))
             stride *= share
         if not better:
             break
@@ -389,7 +405,7 @@ def _past_ripples(shapes, least, s, t, w, c, k, own, p, d, n):
                 off, m = distance(table, brick, sample, s, q)
                 q = along(q, m, -off)
             there = distance_alone(table, brick, sample, t, mapped(w, c, q))
-            if there < low - 1e-9:
+            if there < low - LOWER:
                 low, place = there, q
         there, m = distance(table, brick, sample, t, mapped(w, c, place))
         if low == d or dot(m, n) <= ALIKE:
@@ -406,7 +422,7 @@ def _descended(shapes, s, t, w, c, k, own, p, step, least, around):
     point, the distance at the scale of t, and the normal."""
     ratio = k / own
     d, n = true_distance(shapes, t, mapped(w, c, p))
-    for _ in range(SHARPER):
+    for _ in range(SHARP_ROUNDS):
         if step <= least:
             break
         g = (
@@ -414,18 +430,18 @@ def _descended(shapes, s, t, w, c, k, own, p, step, least, around):
             (w[0][1] * n[0] + w[1][1] * n[1] + w[2][1] * n[2]) * ratio,
             (w[0][2] * n[0] + w[1][2] * n[1] + w[2][2] * n[2]) * ratio,
         )
-        q = _onto(shapes, s, along(p, g, -step), 1.01 * step)
+        q = _onto(shapes, s, along(p, g, -step), SHARP_REACH * step)
         level = norm(sub(q, p)) <= LEVEL_FACE * step
         if level:
             q = lowest_corner(shapes.triangles, s, p, g, around, LEVEL_FACE)
         if norm(sub(q, p)) <= least:
             break
         there, normal = true_distance(shapes, t, mapped(w, c, q))
-        if there < d - 1e-9 and (not level or dot(normal, n) > ALIKE):
+        if there < d - LOWER and (not level or dot(normal, n) > ALIKE):
             p, d, n = q, there, normal
         else:
             # A step by the distance itself leads to where two lines cross.
-            step = d * ratio if least < d * ratio < 0.5 * step else 0.2 * step
+            step = d * ratio if least < d * ratio < 0.5 * step else SHARP_SHORTER * step
     return p, k * d, n
 
 
@@ -466,14 +482,14 @@ def looked_at(shapes, world, motion, matrix, rules, manifolds, p, count, ahead):
             gap = size * d
             if gap > rules.contact_margin:
                 continue
-        elif gap > AWAY:
+        elif gap > TRACED_TO:
             r = _travel(world, motion, matrix, rules, point, one, other, mine, theirs)
             way, gone = norm(r) / size, 0.0
             r = scale(turn_back(matrix, other, r), 1.0 / size)
             if way > d:
-                for _ in range(TRACED):
+                for _ in range(TRACE_ROUNDS):
                     gone += d / way
-                    if gone >= 1.0 or d * size <= AWAY:
+                    if gone >= 1.0 or d * size <= TRACED_TO:
                         break
                     d, n = true_distance(shapes, t, along(x, r, gone))
                 gap = -gone * dot(r, n) * size
@@ -518,7 +534,7 @@ def round_points(shapes, world, motion, matrix, reach, a, b, side, found):
     if table[s, KIND] == CAPSULE:
         count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, 1.0)
         between = 1.0 if table[t, KIND] == PLANE else _lowest(table, brick, sample, s, t, w, c, -1.0, 1.0)
-        if abs(between) <= 0.95:
+        if abs(between) <= CORE_ENDS:
             count = _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, count, between)
     return count
 
@@ -534,7 +550,7 @@ def _ring_points(shapes, world, matrix, reach, one, other, w, c, side, found):
         d = distance_alone(table, brick, sample, t, mapped(w, c, core_point(table, s, 2.0 * e / BEADS - 1.0)))
         found[kept + e, GAP], low, high = d, min(low, d), max(high, d)
     near = (reach + world.scale[one] * core_radius(table, s)) / world.scale[other]
-    level, near_all = high - low <= LEVEL * table[s, SIZE], high <= near
+    level, near_all = high - low <= LEVEL_CIRCLE * table[s, SIZE], high <= near
     step = math.pi * table[s, SIZE] * world.scale[one] / world.scale[other] * 2.0 / BEADS
     for e in range(BEADS):
         d, part = found[kept + e, GAP], 2.0 * e / BEADS - 1.0
@@ -567,9 +583,9 @@ def _core_point(shapes, world, matrix, reach, one, other, w, c, side, found, cou
 def at_least(table, t, d):
     """A lower bound of a point's distance to shape t, from the distance that was read: between the corners of a grid's
     bricks that may be too large."""
-    if table[t, KIND] != GRID or d <= NEAR * table[t, CELL]:
+    if table[t, KIND] != GRID or d <= GRID_FINE * table[t, CELL]:
         return d - table[t, ERROR]
-    return max(NEAR, d / table[t, CELL] - FARTHER) * table[t, CELL]
+    return max(GRID_FINE, d / table[t, CELL] - GRID_FARTHER) * table[t, CELL]
 
 
 @njit(**BARE)

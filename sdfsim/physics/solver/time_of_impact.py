@@ -11,9 +11,8 @@ from numba import njit
 from sdfsim.physics.solver.distance import SIZE, THICKNESS
 from sdfsim.physics.solver.narrow_phase import SOLIDS, nearest, pair_kind
 from sdfsim.physics.solver.surface_distance import is_round
+from sdfsim.physics.solver.tolerances import ON_ITS_WAY, THIN_FAR, THIN_IN
 from sdfsim.physics.solver.vectors import BARE, FAST, along, get, norm, put, scale, sub, to_matrix, turned_by
-
-THIN = 0.4  # relative to a wall: motion in an inner step beyond which a body is checked on its way
 
 
 @njit(**BARE, inline="always")
@@ -46,12 +45,12 @@ def _harmless(shapes, world, a, b):
     depth = math.inf
     if pair_kind(shapes, world.shape[a], world.shape[b]) == SOLIDS:
         for body in (a, b):
-            depth = min(depth, THIN * shapes.table[world.shape[body], THICKNESS] * world.scale[body])
+            depth = min(depth, THIN_FAR * shapes.table[world.shape[body], THICKNESS] * world.scale[body])
         return depth if world.radius[b] < math.inf else math.inf
     for side in range(2):
         one, other = (a, b) if side == 0 else (b, a)
         s, t = world.shape[one], world.shape[other]
-        within = THIN * shapes.table[t, THICKNESS] * world.scale[other]
+        within = THIN_FAR * shapes.table[t, THICKNESS] * world.scale[other]
         if is_round(shapes.table, s):
             return within + shapes.table[s, SIZE] * world.scale[one]
         if shapes.clump_start[s + 1] > shapes.clump_start[s] and not is_round(shapes.table, t):
@@ -70,9 +69,9 @@ def _until_near(shapes, world, motion, work, rules, manifolds, near, scratch, p,
         body = manifolds.pair[p, side]
         scales[side] = world.scale[body]
         put(coms, side, get(world.com, body))
-    deep, way = 0.75 * depth, speed * rules.substep_dt
+    deep, way = THIN_IN * depth, speed * rules.substep_dt
     t = 0.0
-    for _ in range(64):
+    for _ in range(ON_ITS_WAY):
         for side in range(2):
             body = manifolds.pair[p, side]
             span = rules.substep_dt * t

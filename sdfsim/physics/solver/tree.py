@@ -10,10 +10,10 @@ import numpy as np
 from numba import njit
 
 from sdfsim.physics.solver.rows import ANGULAR, LINEAR, MASS, OTHER, velocity_of
+from sdfsim.physics.solver.tolerances import REDUNDANT
 from sdfsim.physics.solver.vectors import BARE, rotated_matrix
 
 EQUATIONS = 6  # largest number of rows that a joint holds
-SOFTEN = 1e-10  # relative to the effect of a unit impulse along a row: makes redundant rows solvable
 
 
 class Graph(NamedTuple):
@@ -78,7 +78,7 @@ def factor(world, work, graph, factors, held, c):
             used = held.active[j, e] > 0
             factors.diagonal[k, e, e] = -1.0
             if used and row[MASS] > 0.0:
-                factors.diagonal[k, e, e] = -held.soft[j, e] - SOFTEN / row[MASS]
+                factors.diagonal[k, e, e] = -held.soft[j, e] - REDUNDANT / row[MASS]
             for s in range(2):
                 p = graph.entry[j, s]
                 if p < 0 or not used:

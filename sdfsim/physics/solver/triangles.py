@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from sdfsim.physics.solver.tolerances import ON_FEATURE
 from sdfsim.physics.solver.vectors import BARE, ENTRY, add, along, dot, get, norm, put, scale, sub
 
 FEATURES = 7  # of a triangle: its face, its three edges, its three corners
-ON_IT = 1e-9  # relative to the solid's size: nearer to a feature its pseudonormal is the normal
 
 
 class Triangles(NamedTuple):
@@ -83,7 +83,7 @@ def signed(triangles, s, p, most):
     if away == math.inf:
         return away, unit, q
     side = -1.0 if dot(offset, m) < 0.0 else 1.0
-    if away > ON_IT * triangles.size[s]:
+    if away > ON_FEATURE * triangles.size[s]:
         unit = scale(offset, side / away)
     return side * away, unit, q
 

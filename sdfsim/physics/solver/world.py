@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sdfsim.physics.options import ROUNDS, SLOP, Options
 from sdfsim.physics.solver.vectors import BARE
 
 POINTS = 24  # largest number of points of a manifold
@@ -130,26 +129,3 @@ class Manifolds(NamedTuple):
     pair: np.ndarray  # [P, 2] int64, ordered; the first is dynamic, or the one with the lower number if both are
     count: np.ndarray  # [P] int64, number of points of each
     point: np.ndarray  # [P, POINTS, COLUMNS]
-
-
-class Rules(NamedTuple):
-    """Options and tolerances of the solve. Lengths and speeds are in model units, in which the smallest bodies are
-    about 1.4 wide."""
-
-    options: Options
-    substep_dt: float  # the inner step
-    slow: float  # an approach up to this speed ends at the surface without a rebound
-    ahead: float = 0.0  # time: new points are searched as much farther as two bodies approach each other in it
-    contact_margin: float = 0.02  # contacts are kept up to this distance, and until they have slid by more
-    search_margin: float = 0.006  # new ones are searched up to this distance
-    still: float = 1e-4  # pairs that have moved by less within a step are not tested again
-    erp: float = 0.2  # share of a penetration that an inner step resolves
-    slop: float = SLOP  # penetration that is not resolved
-    rounds: int = ROUNDS  # largest number of sweeps of sequential impulses
-    exact: float = 2e-5  # sweeps end when no impulse changes a velocity by more
-    apart: float = 0.03  # least distance of points of a manifold from each other
-    # stray, rest: a body that stays within `stray` for `rest` steps falls asleep, if its forces are so nearly in
-    # balance that they would move it by less than `drift` in the same time
-    stray: float = 0.005
-    rest: int = 25
-    drift: float = 2e-4
