@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ from sdfsim.shape.shape import Shape
 
 SAMPLES, LINES = 4, 8  # places along a side of a pixel, and lines in it
 EVEN = 0.02  # radii by which a turned body that looks alike may differ
+HOVERS, UPRIGHT = 0.1, 0.99  # radii above what a body lies on; cosine between an axis and its normal
 FACES, LARGE = 8, 0.05  # most parts with a colour of their own; least share of the surface of one
 
 
@@ -52,6 +54,7 @@ class Look:
         self.corners = vertices[:: max(1, len(vertices) // 500)]
         self.radius = self.ball or float(np.linalg.norm(vertices, axis=1).max())
         self.axis = None if self.ball else _axis_of(shape)
+        self.normal: np.ndarray | None = None  # [3] of the surface on which it lies; it only slides and turns there
         self.parts, self.round, self.faces = 1, True, []
         if not self.ball:
             self.part = _parts(Mesh(vertices, shape.mesh.faces))
@@ -70,7 +73,44 @@ class Look:
     @property
     def ways(self) -> int:
         """How many of the six ways to move it pictures show: not a ball's rotation, nor a cup's about its axis."""
+        if self.normal is not None:
+            axis = None if self.axis is None else pose.rotate(self.turn, self.axis)
+            return 2 if axis is not None and abs(axis @ self.normal) > UPRIGHT else 3
         return 3 if self.ball else 6 if self.axis is None else 5
+
+    @property
+    def shifts(self) -> int:
+        """How many of these ways are shifts."""
+        return 3 if self.normal is None else 2
+
+    def lying(self, scene: Scene, body: Body) -> Look | None:
+        """The body as it lies where the scene has it; None if it lies on nothing that stays, or is a ball."""
+        place = body.position + pose.rotate(body.quat_xyzw, self.com)
+        points, below = pose.rotate(body.quat_xyzw, self.corners) + place, []
+        for other in scene.bodies:
+            if other.motion != "dynamic":
+                turn = pose.conjugate(other.quat_xyzw)
+                far, slope = scene.shapes[other.shape].sdf(pose.rotate(turn, points - other.position) / other.scale)
+                least = int(np.argmin(far))
+                below.append((other.scale * float(far[least]), pose.rotate(other.quat_xyzw, slope[least]), other))
+        gap, normal, on = min(below, key=lambda one: abs(one[0]), default=(np.inf, place, body))
+        if self.ball or abs(gap) > HOVERS * self.radius or on.motion != "static" or normal @ scene.gravity >= 0.0:
+            return None
+        same = copy(self)
+        same.normal, same.seat, same.turn = normal, place - gap * normal, body.quat_xyzw
+        return same
+
+    def laid(self, eye: Eye, place: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The pose in which a lying body is seen in the same place of the picture, turned alike; else the same pose."""
+        if self.normal is None:
+            return place, turn
+        camera = -eye.rotation.T @ eye.translation
+        share = (self.normal @ (self.seat - camera)) / (self.normal @ (place - camera))
+        by = pose.multiply(turn, pose.conjugate(self.turn))
+        twist = np.r_[self.normal * (self.normal @ by[:3]), by[3]]
+        length = np.linalg.norm(twist)
+        turned = pose.multiply(twist / length, self.turn) if length > 1e-6 else self.turn
+        return (camera + share * (place - camera) if share > 0.0 else place), turned
 
     def window(self, eye: Eye, place: np.ndarray, turn: np.ndarray, margin: float) -> Window | None:
         """The part of the picture that holds it; None if it is behind the camera or outside."""

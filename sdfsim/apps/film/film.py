@@ -26,6 +26,7 @@ from sdfsim.apps.film.track import (
     either,
     find,
     follow,
+    lies,
     masks,
     shutter_of,
     without_others,
@@ -37,7 +38,7 @@ from sdfsim.base.errors import SdfsimError, nearest
 from sdfsim.base.parallel import Progress, silent
 from sdfsim.physics import pose
 from sdfsim.scene.builder import SceneBuilder, loaded
-from sdfsim.scene.scene import Scene, Waypoints
+from sdfsim.scene.scene import Body, Scene, Waypoints
 
 FITS = 0.6  # score that most frames of a body of the right shape have
 ENOUGH = 8  # frames in which a body must be seen
@@ -94,11 +95,22 @@ def watched(
     supports = supported(clip, back, eye, [Look(scene, body) for body in led], led, shutter, on_progress)
     if supports:
         supports, back = behind_others(clip, eye, supports, shutter)
-    for body, look in zip(moving, looks, strict=True):
+
+    def whole(body: Body, look: Look) -> Track:
         place = body.position + pose.rotate(body.quat_xyzw, look.com)
-        k, first = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(moving) == 1)
-        tracks.append(follow(clip, back, look, eye, shutter, k, first, gravity, on_progress=on_progress))
-        _judged(clip, tracks[-1], body.name)
+        k, one = find(clip, back, look, eye, place, body.quat_xyzw, body.name, on_progress, free=len(moving) == 1)
+        track = follow(clip, back, look, eye, shutter, k, one, gravity, on_progress=on_progress)
+        _judged(clip, track, body.name)
+        return track
+
+    for body, look in zip(moving, looks, strict=True):
+        try:
+            lying = look.lying(scene, body)
+            tracks.append(whole(body, lying or look))
+        except SdfsimError:
+            if lying is None:
+                raise
+            tracks.append(whole(body, look))
     shutter = shutter_of(clip, back, eye, tracks[0])
     covered = [masks(clip, eye, one) for one in tracks]
     every = [either([of[k] for of in covered]) for k in range(len(clip.time))]
@@ -106,14 +118,19 @@ def watched(
         supports, back = behind_others(clip, eye, supports, shutter, every)
     else:
         back = background(clip, every)
-    refined = []
-    for d, one in enumerate(tracks):
+
+    def refined(track: Track, others: list[np.ndarray | None]) -> Track:
+        k = max(track.frames.tolist(), key=lambda k: track.at(k).score)
+        full = follow(clip, back, track.look, eye, shutter, k, track.at(k), gravity, others, on_progress)
+        return without_others(clip, eye, again(clip, back, eye, shutter, full, others))
+
+    for d, (body, look) in enumerate(zip(moving, looks, strict=True)):
         others = [either([of[k] for j, of in enumerate(covered) if j != d]) for k in range(len(clip.time))]
-        k = max(one.frames.tolist(), key=lambda k: one.at(k).score)
-        full = follow(clip, back, one.look, eye, shutter, k, one.at(k), gravity, others, on_progress)
-        full = without_others(clip, eye, again(clip, back, eye, shutter, full, others))
-        refined.append(deepened(clip, eye, full))
-    tracks = refined
+        full = refined(tracks[d], others)
+        if full.look is not look:
+            free = again(clip, back, eye, shutter, Track(look, full.seen), others)
+            full = free if lies(clip, full, free) else refined(whole(body, look), others)
+        tracks[d] = deepened(clip, eye, full)
     for body, one in zip([*led, *moving], [*supports, *tracks], strict=True):
         _judged(clip, one, body.name)
     for body, one in zip(moving, tracks, strict=True):

@@ -18,6 +18,7 @@ from sdfsim.apps.film.eye import WAYS, Eye
 from sdfsim.physics import pose
 
 ROUNDS = 12
+GRAZING = 0.1  # sine of the least angle between what a body lies on and the line of sight
 TRY = 0.3  # px, steps of derivatives
 ODD = 3.0  # standard deviations beyond which a pixel counts less
 MARGIN = 5.0  # px around a body that are compared
@@ -36,6 +37,7 @@ BESIDE, NEAR = 0.05, 0.05  # shares: of a pixel that the body may cover beside i
 HAND = 0.6  # share of what is around a body that differs from the background: then it is a part of something larger
 AROUND = 3  # px from a body's outline, where that is looked for
 UNLIKE = 5.0  # standard deviations of noise from which it differs
+VISIBLE = 1.5  # mean square of differences to the background, relative to noise, of something that is there
 FLOOR = 0.12  # px: shadows and light shift an outline by as much, alike in all frames
 
 
@@ -198,6 +200,13 @@ def axes(look: Look, eye: Eye, place: np.ndarray, turn: np.ndarray) -> np.ndarra
     local = eye.seen(place)
     pixel = local[2] / eye.focal
     large = max(look.radius / pixel, 1.0)
+    if look.normal is not None:
+        ray = eye.rotation.T @ local / np.linalg.norm(local)
+        across = np.cross(ray, look.normal)
+        across /= max(float(np.linalg.norm(across)), 1e-9)
+        ahead = np.cross(look.normal, across) / max(abs(float(look.normal @ ray)), GRAZING)
+        slid = np.asarray(block_diag(pixel * np.stack([across, ahead], 1), look.normal[:, None] / large))
+        return slid[:, : look.ways]
     shift = eye.rotation.T @ np.stack([[pixel, 0, 0], [0, pixel, 0], local / large], 1)
     about = eye.rotation.T
     if look.axis is not None:  # about two axes across its own
@@ -214,6 +223,7 @@ def fitted(
     """The pose near a first guess that explains a frame best; `wide`: px by which both are smeared, for a guess that
     is off by as much; without `turned` its orientation stays, as smeared pictures hardly show it; `shadows` beside the
     body are known by their colour. None if it is not in the picture."""
+    place, turn = look.laid(eye, place, turn)
     most = SMEARED * look.radius * eye.focal / max(float(eye.seen(place)[2]), look.radius)
     flow = flow * min(1.0, most / max(float(np.hypot(*flow)), 1e-9))
     at = look.window(eye, place, turn, MARGIN + 3.0 * wide + 0.6 * float(np.abs(flow).max()))
@@ -232,7 +242,7 @@ def fitted(
     for _ in range(rounds):
         _, normal, pull = slopes
         by = -np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-3), pull)
-        by[3:] *= turned
+        by[look.shifts :] *= turned
         by *= min(1.0, (1.5 + wide) / max(np.abs(by).max(), 1e-9))
         new = moved(look, eye, place, turn, by)
         if eye.seen(new[0])[2] < 1.5 * look.radius:
@@ -295,7 +305,7 @@ def _seen(seen: Comparison, place, turn, color, rest, weight, slope, normal, pul
     counts = weight if look.support else seen.weight  # what lies on a support is not explained by it
     total = float((before * counts).sum())
     score = 1.0 - float((small * counts).sum()) / max(total, 1e-9)
-    if total < 4.0 * seen.noise**2 * seen.weight.size or (not look.support and seen.reaches(place, turn) > HAND):
+    if total < VISIBLE * seen.noise**2 * seen.weight.size or (not look.support and seen.reaches(place, turn) > HAND):
         score = min(score, 0.0)
     return Seen(place, turn, full @ np.linalg.pinv(axes(look, eye, place, turn)), full @ off, full @ like, color,
                 score, np.sqrt(mean))  # fmt: skip

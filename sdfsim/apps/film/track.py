@@ -26,6 +26,7 @@ FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
 TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
 WORSE = 0.03  # score below the best, from which the best's orientation is tried again
+SEEN = 0.9  # share of the frames in which a body that lies is seen
 SAME, SAME_TURN = 0.2, 0.01  # px, and rad, between predictions that count as one
 JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
 NEARER, APPROACH = 0.05, 5.0  # share of the distance to the camera, and m/s, by which it changes at most
@@ -364,6 +365,14 @@ def again(
                      shadows=shadows)  # fmt: skip
         seen[k] = None if new is None or new.score < POOR or at_edge(track.look, eye, new.place, new.turn) else new
     return Track(track.look, seen)
+
+
+def lies(clip: Clip, lying: Track, free: Track) -> bool:
+    """Whether a body that was taken to lie does: it is seen nearly always, and poses in which it may also be tilted or
+    in the air explain hardly more."""
+    rows = free.frames
+    more = [free.at(k).score - lying.at(k).score for k in rows]
+    return len(rows) > SEEN * len(clip.time) and bool((np.quantile(more, (0.5, 0.9)) < (WORSE, 2.0 * WORSE)).all())
 
 
 def shutter_of(clip: Clip, back: Background, eye: Eye, track: Track) -> Shutter:
