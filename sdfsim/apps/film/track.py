@@ -36,7 +36,7 @@ GOOD, POOR = 0.75, 0.5  # scores of a body that is found, and of one that is los
 ALIKE = 2.0  # how much larger errors of depth are than they scatter from frame to frame
 FAR = 6  # frames for which a lost body is looked for where it would fly
 TWIN = 0.85  # score of each of two things that may both be the body
-OTHER = 60.0  # levels by which a ball's colour never differs from that in other frames
+OTHER, OTHERS = 60.0, 90.0  # levels by which the colour of a ball, and the mean of a body's, differ between frames
 DIM = 0.25  # score below the median of a film, of frames that do not count
 HUE, FAINT = 0.08, 10.0  # how much hues of one thing differ; levels that are noise
 SHUTTERS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0)  # of the time between frames
@@ -187,10 +187,15 @@ def _twins(found: list[tuple[int, Seen]], look: Look) -> bool:
     return min(ways) > 2.0 * look.radius
 
 
+def _tone(one: Seen) -> np.ndarray:
+    """[3] the mean colour of the faces that are seen."""
+    seen = one.color[(one.color > 1.0).any(1)]
+    return np.asarray(seen.mean(0) if len(seen) else np.zeros(3))
+
+
 def _hue(one: Seen) -> np.ndarray:
     """[3] shares of red, green and blue in the faces that are seen; those of dark faces are noise, and about even."""
-    seen = one.color[(one.color > 1.0).any(1)]
-    mean = (seen.mean(0) if len(seen) else np.zeros(3)) + FAINT
+    mean = _tone(one) + FAINT
     return mean / mean.sum()
 
 
@@ -296,8 +301,10 @@ def _distant(eye: Eye, place: np.ndarray, other: np.ndarray) -> bool:
 
 
 def _repainted(look: Look, one: Seen, first: Seen) -> bool:
-    """Whether what looks like a ball has another colour than it: a place that it left, seen before the background."""
-    return bool(look.ball) and float(np.abs(one.color[0] - first.color[0]).max()) > OTHER
+    """Whether what looks like a body has another colour than it: a place that it left, seen before the background.
+    Faces of one body may differ, those of a ball do not."""
+    off = one.color[0] - first.color[0] if look.ball else _tone(one) - _tone(first)
+    return float(np.abs(off).max()) > (OTHER if look.ball else OTHERS)
 
 
 def predicted(clip, eye, shutter, at, before, gravity) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
