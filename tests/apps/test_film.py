@@ -20,6 +20,7 @@ from sdfsim.apps.film.drawing import Look, _covered
 from sdfsim.apps.film.eye import Eye
 from sdfsim.apps.film.film import identify_clips, settled, watched, with_moving
 from sdfsim.apps.film.frames import read_clip, true_times
+from sdfsim.apps.film.poses import axes
 from sdfsim.apps.film.room import of_room, photos_of
 from sdfsim.apps.identify.report import write_scene
 from sdfsim.base.errors import SdfsimError
@@ -580,3 +581,35 @@ def test_a_hand_of_the_cups_colour_is_not_the_cup(tmp_path):
     _, fit = settled([film])
     value = {(e.kind, e.name): e for e in fit.shown().estimates}["friction", "cup / floor"]
     assert value.value == pytest.approx(friction, abs=0.03)
+
+
+def test_what_lies_on_something_only_slides_and_turns_there(tmp_path):
+    up, size = np.array([0.0, -0.6, 0.8]), {"radius": 0.03, "height": 0.1}
+    turn = Rotation.align_vectors(up[None], [[0, 0, 1.0]])[0]
+    over = (turn * Rotation.from_euler("x", 90, degrees=True)).as_quat()
+    for shape, away, quat, ways in (
+        ({"box": {"size": (0.2, 0.1, 0.04)}}, 0.02, turn.as_quat(), 3),
+        ({"cylinder": size}, 0.05, turn.as_quat(), 2),
+        ({"cylinder": size}, 0.03, over, 3),
+        ({"mesh": cup_file(tmp_path)}, 0.0, turn.as_quat(), 2),
+        ({"box": {"size": (0.2, 0.1, 0.04)}}, 0.06, turn.as_quat(), None),  # in the air
+        ({"sphere": {"radius": 0.04}}, 0.04, turn.as_quat(), None),
+    ):
+        scene = sdfsim.Scene(model="solver").add("slope", plane={"normal": up.tolist(), "offset": 0.1})
+        scene = scene.add("thing", position=(0.1 + away) * up, quat_xyzw=quat, mass=0.3, **shape).load()
+        look = Look(scene, scene.bodies[1])
+        lying = look.lying(scene, scene.bodies[1])
+        if ways is None:
+            assert lying is None
+            continue
+        assert lying.ways == ways
+        seat = scene.bodies[1].position + Rotation.from_quat(quat).apply(look.com)
+        tilted = Rotation.from_rotvec(0.3 * np.cross(up, [1.0, 0, 0])) * Rotation.from_rotvec(0.7 * up)
+        guess = seat + np.array([0.03, 0.02, 0.05])
+        place, turned = lying.laid(NEAR_EYE, guess, (tilted * Rotation.from_quat(quat)).as_quat())
+        assert up @ (place - seat) == pytest.approx(0.0, abs=1e-9)
+        np.testing.assert_allclose(NEAR_EYE.project(place), NEAR_EYE.project(guess), atol=1e-6)
+        about = (Rotation.from_quat(turned) * Rotation.from_quat(quat).inv()).as_rotvec()
+        np.testing.assert_allclose(about, (about @ up) * up, atol=1e-9)
+        assert about @ up == pytest.approx(0.7, abs=0.05)
+        np.testing.assert_allclose(up @ axes(lying, NEAR_EYE, place, turned)[:3], 0.0, atol=1e-9)
