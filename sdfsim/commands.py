@@ -3,6 +3,7 @@ evaluate; tradeoff, stress."""
 
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import typer
@@ -68,7 +69,9 @@ def simulate(
     ]
     print_failed(session, report)
     if "recording" in report:
-        lines.append(f"watch it: sdfsim view {out}   (or: rerun {report['recording']})")
+        lines.append(
+            "watch it: sdfsim view {}   (or: rerun {})".format(*(quote(str(p)) for p in (out, report["recording"])))
+        )
     lines += [f"outside the model's training: {line}" for line in report["outside_training"]]
     lines.append(f"laws: surfaces measured in {report['frames_measured']} of {report['frames']} frames, energy in all")
     lines += [f"breaks a law: {line}" for line in report["broken_laws"]]
@@ -89,7 +92,9 @@ def play(
     ],
     model: Model = None,
     paused: Annotated[bool, typer.Option("--paused", help="Time stands still at first.")] = False,
-    port: Annotated[int | None, typer.Option(help="Port of the page (default: 8080, or a free one).")] = None,
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Port of the page (default: 8080, or a free one).")
+    ] = None,
     allow_outside: Outside = False,
 ) -> None:
     """Scene, room, shape, mesh or robot -> a live page: drag, throw, pause, save (docs/viewing.md)."""
@@ -165,7 +170,7 @@ def render(
     size: Annotated[
         tuple[int, int] | None, typer.Option(metavar="W H", help="Width and height, px (default: 960 540).")
     ] = None,
-    fps: Annotated[float, typer.Option(help="Frames of a movie in a second.")] = 30.0,
+    fps: Annotated[float | None, typer.Option(help="Frames of a movie in a second (default: 30).")] = None,
     light: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="Direction to the sun (default: above and beside the camera)."),
@@ -182,6 +187,8 @@ def render(
     """Run -> movie or picture, without a screen."""
     if at is not None and out.suffix != ".png":
         raise SdfsimError("--at needs a picture, -o FILE.png", exit_code=EXIT_USAGE)
+    if fps is not None and out.suffix == ".png":
+        raise SdfsimError("--fps needs a movie, -o FILE.mp4", exit_code=EXIT_USAGE)
     from sdfsim.apps import render as room
     from sdfsim.apps.beside import beside_of
     from sdfsim.apps.run import read_run
@@ -191,8 +198,9 @@ def render(
     loaded, rollout = read_run(source, scene, allow_outside=allow_outside, on_progress=shapes)
     beside = beside_of(source, loaded)
     room.render(
-        loaded, rollout, out, camera=camera, look_at=look_at, at=at, size=size, fps=fps, light=light,
-        background=background or room.SKY, opacity=room.shares(opacity or []), beside=beside, on_progress=frames,
+        loaded, rollout, out, camera=camera, look_at=look_at, at=at, size=size, light=light, beside=beside,
+        fps=room.FRAMES if fps is None else fps, background=background or room.SKY,
+        opacity=room.shares(opacity or []), on_progress=frames,
     )  # fmt: skip
     session.report({"picture" if out.suffix == ".png" else "movie": out}, [f"wrote {out}"])
 
@@ -307,6 +315,8 @@ def identify(
 
     if out is not None:
         check_writable(out.parent)
+        if scene is not None and out.resolve() == scene.resolve():
+            raise SdfsimError(f"{out}: would replace the scene that it is made from", "give another file: -o")
     shapes, fit = partial(session.stage_progress, "shapes"), partial(session.stage_progress, "identify")
     if any(path.suffix.lower() in FILMS for path in recordings):
         from sdfsim.apps.film.film import identify_clips
@@ -325,6 +335,11 @@ def identify(
             lines += [*write_scene(seen, scene, out), f"wrote {out}", f"wrote {beside}: the fit's motion over the film"]
         session.report(seen.report() | wrote, lines)
         return
+    for name, given in {"points": points, "start": start, "end": end, "body": body}.items():
+        if given is not None:
+            raise SdfsimError(f"--{name}: is for films", "leave it out for recordings of poses")
+    if slow != 1.0:
+        raise SdfsimError(f"--slow {slow:g}: is for films", "divide the times of the recording by it")
     paths = [public_tosses(path, partial(session.stage_progress, "fetch")) for path in recordings]
     public = [path for path, given in zip(paths, recordings, strict=True) if path != given]
     scene = scene or next((path / "scene.yaml" for path in public), None)

@@ -65,6 +65,7 @@ MOST_GROUPS = 31  # MuJoCo's bit masks
 # MuJoCo refuses moments of inertia below 1e-14 kg m^2, and convex pieces of hardly any volume. Below this moment,
 # kg m^2, or this size of a mesh, m, the unit of length is a thousandth.
 LEAST_MOMENT, LEAST_SIZE, FINER = 1e-13, 1e-3, 1000.0
+WEIGHTLESS = 1e-9  # kg, of a link of URDF that is only a frame
 MOST_TOLD = 8  # names in a line of the report
 # Names that are taken: our own, MuJoCo's, and device names, which Windows does not allow for files.
 RESERVED = ("world", "root", "physics", "materials", "shapes", "groups", "joints", "con", "prn", "aux", "nul")
@@ -88,6 +89,7 @@ class Take:
     time: np.ndarray  # [T] s
     position: np.ndarray  # [T, N, 3] m, of the shapes' own origins
     quat_xyzw: np.ndarray  # [T, N, 4], with the sign that is nearer to the time before
+    velocity: np.ndarray  # [T, N, 3] m/s, of the origins
     collide: Collide = "pieces"
     rate: float = RATE  # USD time codes per second
     ascii: bool = False  # whether the names have no other letters than those of ASCII
@@ -107,12 +109,16 @@ class Take:
         return 6.0 * framed(self.scene)[1]
 
     def at_rate(self, fps: float) -> "Take":
-        """The same motion at `fps` evenly spaced times per second, interpolated between frames. The last time is not
-        before the end, and has the last pose."""
+        """The same motion at `fps` evenly spaced times per second, interpolated between frames by their velocities, so
+        that a flight stays a parabola. The last time is not before the end, and has the last pose."""
+        from scipy.interpolate import CubicHermiteSpline
+
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         place, turn = between(self.time, self.position, self.quat_xyzw, time)
-        return replace(self, time=time, position=place, quat_xyzw=turn, rate=fps)
+        if self.moving:
+            place = CubicHermiteSpline(self.time, self.position, self.velocity)(np.minimum(time, self.time[-1]))
+        return replace(self, time=time, position=place, quat_xyzw=turn, velocity=0.0 * place, rate=fps)
 
 
 Written = tuple[list[Path], list[str]]  # the files of an export, and what is left out, one line each
@@ -160,6 +166,8 @@ def export(
         _pxr("Usd")  # checked before fitting shapes, which takes minutes
     check_writable(out.parent)
     take = replace(_read(source, scene_file, FORMATS[kind], allow_outside, on_progress), collide=collide)
+    if fps is not None and not take.moving:
+        raise SdfsimError(f"--fps {fps:g}: {source} has no motion", "leave it out, or export a run")
     take = take if fps is None else take.at_rate(fps)
     out.parent.mkdir(parents=True, exist_ok=True)
     files, left_out = FORMATS[kind](take, out, on_progress)
@@ -212,12 +220,15 @@ def _read(
         turn[1:] *= np.cumprod(np.where((turn[1:] * turn[:-1]).sum(-1) < 0, -1.0, 1.0), axis=0)[..., None]
         com = np.array([body.scale * scene.shapes[body.shape].com for body in scene.bodies])
         offset = Rotation.from_quat(turn.reshape(-1, 4)).apply(np.tile(com, (len(turn), 1)))
-        place = run.position - offset.reshape(run.position.shape)
+        offset = offset.reshape(run.position.shape)
+        place, speed = run.position - offset, run.velocity - np.cross(run.angular_velocity, offset)
         planes = [k for k, body in enumerate(scene.bodies) if is_infinite(scene.shapes[body.shape])]
         place[:, planes] = np.reshape([scene.bodies[k].position for k in planes], (-1, 3))
+        speed[:, planes] = 0.0
     else:
         time, turn = np.zeros(1), np.array([[body.quat_xyzw for body in scene.bodies]])
         place = np.array([[body.position for body in scene.bodies]])
+        speed = 0.0 * place
     # ROS allows ASCII only, and programs that read URDF may not find files with other names.
     ascii = write is _urdf
     names, shapes = (plain_names([one.name for one in ones], ascii) for ones in (scene.bodies, scene.shapes))
@@ -227,7 +238,7 @@ def _read(
         more = f", and {len(renamed) - MOST_TOLD} more" if len(renamed) > MOST_TOLD else ""
         notes.append(", ".join(renamed[:MOST_TOLD]) + more)
     colors = np.array(body_colors(scene), dtype=np.uint8)
-    return Take(scene, names, shapes, colors, time, place, turn, ascii=ascii, notes=tuple(notes))
+    return Take(scene, names, shapes, colors, time, place, turn, speed, ascii=ascii, notes=tuple(notes))
 
 
 def _near(scene: Scene) -> tuple[Scene, list[str]]:
@@ -396,10 +407,11 @@ def _write_xml(path: Path, root: XML) -> None:
     write_text(path, ElementTree.tostring(root, encoding="unicode") + "\n")
 
 
-def _missing(take: Take, *, motion: bool = False, textures: bool = False) -> list[str]:
-    """The lines for a format without motion, or without textures."""
+def _missing(take: Take, *, motion: bool = False, textures: bool = False, frames: bool = False) -> list[str]:
+    """The lines for a format without motion, without textures, or without frames."""
     led = any(body.motion == "kinematic" for body in take.scene.bodies)
     lines = {
+        "frames": bool(take.scene.frames) and not frames,
         "the motion: the scene is exported as at the start": take.moving and not motion,
         "the paths of kinematic bodies: they stay at their start": led and not (take.moving and motion),
         "stiffness and damping of contacts: all bodies are rigid": any(
@@ -700,7 +712,7 @@ def _mjcf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     posed = {name: _posed(take.scene, name) for name in take.scene.keyframes if name != "start"}
     posed = {name: _refined(replace(take, scene=at))[0].scene for name, at in posed.items()}
     take, left_out = _refined(take)
-    scene, left_out = take.scene, [*left_out, *_missing(take)]
+    scene, left_out = take.scene, [*left_out, *_missing(take, frames=True)]
     sampled = take.collide == "sdf"
     seen, cut = _write_assets(take, out, lambda body: not sampled, on_progress)
     root = XML("mujoco", model=plain_names([out.stem])[0])
@@ -957,7 +969,11 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
             held_at = tree.above[above.parent].anchor if above.parent in tree.above else np.zeros(3)
             jointed.urdf_joint(root, above, k, joint_names, links, held_at, take.scene)
         for frame in (f for f in take.scene.frames if f.body == k and f.name not in take.names):
-            add(root, "link", name=frame.name)
+            # Without a mass, PyBullet takes a link for one of 1 kg.
+            weight = add(add(root, "link", name=frame.name), "inertial")
+            add(weight, "mass", value=numbers(WEIGHTLESS))
+            small = numbers(WEIGHTLESS**2)
+            add(weight, "inertia", ixx=small, iyy=small, izz=small, ixy="0", ixz="0", iyz="0")
             joint = add(root, "joint", name=f"{frame.name}_frame", type="fixed")
             add(joint, "parent", link=name)
             add(joint, "child", link=frame.name)
@@ -968,13 +984,17 @@ def _urdf(take: Take, out: Path, on_progress: StageProgress) -> Written:
     assets = [*seen.values(), *(file for found in cut.values() for file in found)]
     if single:
         return [*files, *assets], []
-    poses = out.with_suffix(".csv")
+    poses = out.with_suffix(".poses.csv")  # not NAME.csv, which is what recordings are called
     position, quat = take.position[:1].copy(), take.quat_xyzw[:1].copy()
     held = [k for k in roots if k in tree.above]  # by a joint in the world, which is the first link of their files
     position[:, held], quat[:, held] = 0.0, (0.0, 0.0, 0.0, 1.0)
     start = replace(take, time=take.time[:1], position=position, quat_xyzw=quat)
     _write_poses(start, poses, roots)
-    left_out = ["the poses of bodies: they are in the CSV", "gravity, velocities and collides_with", *_missing(take)]
+    left_out = [
+        "the poses of bodies: they are in the CSV",
+        "gravity, velocities and collides_with",
+        *_missing(take, frames=True),
+    ]
     left_out += jointed.urdf_left_out(take.scene, tree)
     return [*files, poses, *assets], left_out
 

@@ -118,7 +118,8 @@ def read_mjcf(path: Path, *, key: str | None = None) -> Robot:
         message = "; ".join(part.strip() for part in str(error).splitlines() if part.strip())
         line = re.search(r"\bline (\d+)", message)
         where = f"{path}:{line[1]}" if line else str(path)
-        raise SdfsimError(f"{where}: MuJoCo refuses it ({message})", "a URDF needs the ending .urdf") from error
+        hint = "a URDF needs the ending .urdf" if "<robot" in path.read_text(encoding="utf-8", errors="replace") else ""
+        raise SdfsimError(f"{where}: MuJoCo refuses it ({message})", hint) from error
     return _Reader(path, mujoco, model, key).robot()
 
 

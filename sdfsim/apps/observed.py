@@ -30,6 +30,7 @@ from sdfsim.simulate.batch import Copies, inner_of_frame
 
 COLUMNS = ("time", "body", "x", "y", "z", "qx", "qy", "qz", "qw")
 ARRAYS = ("position", "quat_xyzw")  # arrays in an npz of poses, besides `dt` or `time`, and `names` and `start`
+SLOWEST = 1.0  # s between frames: nothing that falls is seen with fewer
 EVEN = 0.1  # relative to the spacing: how far a time may be off an even grid
 NEAR, LEAST = 3, 5  # frames on each side that decide whether a frame is in smooth motion; frames of the shortest flight
 BEYOND = 5.0  # standard deviations beyond which a difference is not noise
@@ -166,7 +167,7 @@ def _csv(path: Path, moving: list[str]) -> list[tuple[str, float, np.ndarray]]:
     """Spacing in s and poses [T, D, 7] of the bodies, positions [m] before quaternions; NaN for missing poses."""
     rows: dict[tuple[float, str], list[float]] = {}
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             if tuple(reader.fieldnames or ()) != COLUMNS:
                 raise SdfsimError(f"{path}:1: columns must be {','.join(COLUMNS)}")
@@ -244,6 +245,8 @@ def _on_grid(path: Path | str, times: np.ndarray, poses: np.ndarray) -> tuple[fl
     if (gaps <= 0.0).any():
         raise SdfsimError(f"{path}: time: must increase (frame {int((gaps <= 0.0).argmax()) + 1})")
     dt = float(np.median(gaps))
+    if dt > SLOWEST:
+        raise SdfsimError(f"{path}: time: frames are {dt:.3g} s apart (at most {SLOWEST:g})", "times are in seconds")
     dt = float(np.ptp(times)) / max(1, round(np.ptp(times) / dt))
     frame = np.round((times - times[0]) / dt).astype(int)
     off = np.abs((times - times[0]) / dt - frame)

@@ -64,8 +64,13 @@ def render(
         with replacing(out) as partial:
             Image.fromarray(pixels).save(partial, format="PNG")
         return
-    if style.background is None or not fps > 0 or camera.width % 2 or camera.height % 2:
-        raise SdfsimError("a movie needs a background that is not transparent, even sizes, and --fps above zero")
+    for fault, given in (
+        ("--background: a movie cannot be transparent", style.background is None),
+        (f"--fps {fps:g}: must be above zero", not fps > 0),
+        (f"--size {camera.width} {camera.height}: a movie needs even sizes", camera.width % 2 or camera.height % 2),
+    ):
+        if given:
+            raise SdfsimError(fault)
     count = max(1, round(float(rollout.time[-1] - rollout.time[0]) * fps) + 1)
 
     def pictures() -> Iterator[np.ndarray]:

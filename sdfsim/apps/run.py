@@ -170,32 +170,36 @@ def simulate(
                 parts.append(error.rollout)
                 kept.add(error.rollout)
             kept.save()
-        rollout = join(parts)
-        rollout = replace(rollout, meta=rollout.meta | {"scene": known})
-        on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
+        try:
+            rollout = join(parts)
+            rollout = replace(rollout, meta=rollout.meta | {"scene": known})
+            on_progress("simulate", 1.0, f"{len(rollout)} steps" + (" (stopped early)" if broken else ""))
 
-        report = summary(scene, rollout, running() - started) | {
-            "compiling_s": round(seconds_spent() - compiled, 3),
-            "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
-            "folder": out,
-            "identity": kept.identity,
-            "failed_checks": [f"fit of shape {reason}" for reason in scene.missed],
-            "caveats": [f"fit of shape {reason}" for reason in scene.caveats],
-            "notes": list(scene.notes),
-        }
-        if until_settled:
-            report["settled"] = settled()
-        if beside is not None:
-            report["beside"] = off(scene, rollout, beside)
-            beside.save(out / FILE)
-        if isinstance(broken, SdfsimError):
-            report["error"] = broken.message
-        rollout.save(out / "rollout.npz")
-        if viewer != "none":
-            save_rollout(scene, rollout, out / "rollout.rrd", beside)
-            report["recording"] = out / "rollout.rrd"
-        report = plain(report)
-        write_json(out / _REPORT, report)
+            report = summary(scene, rollout, running() - started) | {
+                "compiling_s": round(seconds_spent() - compiled, 3),
+                "status": "done" if broken is None else "failed" if isinstance(broken, SdfsimError) else "interrupted",
+                "folder": out,
+                "identity": kept.identity,
+                "failed_checks": [f"fit of shape {reason}" for reason in scene.missed],
+                "caveats": [f"fit of shape {reason}" for reason in scene.caveats],
+                "notes": list(scene.notes),
+            }
+            if until_settled:
+                report["settled"] = settled()
+            if beside is not None:
+                report["beside"] = off(scene, rollout, beside)
+                beside.save(out / FILE)
+            if isinstance(broken, SdfsimError):
+                report["error"] = broken.message
+            rollout.save(out / "rollout.npz")
+            if viewer != "none":
+                save_rollout(scene, rollout, out / "rollout.rrd", beside)
+                report["recording"] = out / "rollout.rrd"
+            report = plain(report)
+            write_json(out / _REPORT, report)
+        except KeyboardInterrupt:
+            kept.save()
+            raise
         if not isinstance(broken, KeyboardInterrupt):
             kept.clear()
         if isinstance(broken, SimulationError):
@@ -241,10 +245,11 @@ def recorded(
     if rollout.suffix != ".npz" or not rollout.is_file():
         return place
     recording = rollout.with_suffix(".rrd")
-    if not recording.exists():
+    if not recording.exists() or scene_file is not None:  # a scene that is given may be another
         scene, motion = read_run(place, scene_file, allow_outside=allow_outside, on_progress=on_progress)
-        save_rollout(scene, motion, recording, beside_of(place, scene))
-        say(f"wrote {recording}, drawn from {rollout.name}: the run has no recording")
+        if not recording.exists():
+            save_rollout(scene, motion, recording, beside_of(place, scene))
+            say(f"wrote {recording}, drawn from {rollout.name}: the run has no recording")
     return recording
 
 

@@ -74,6 +74,11 @@ class _Reader:
         self.missed: list[str] = []
         self.notes: list[str] = []
         self.meshes: dict[Path, Loaded] = {}
+        self.limits: dict[str, tuple[float, float] | None] = {}  # of hinges and sliders, rad or m
+        self.start: dict[str, float] = {}
+        for folder in packages:
+            if not folder.is_dir():
+                raise SdfsimError(f"{folder}: no such folder of packages", "give folders that hold the packages")
         self.root = self._parse(self._content())
         if any(element.tag.startswith("xacro:") for element in self.root.iter()):
             self.root = self._parse(self._expanded())
@@ -240,14 +245,14 @@ class _Reader:
             k = error.args[1][0]
             fault = f"link {links[k].name!r} holds itself: URDF supports trees only"
             raise self.wrong(by_child[k][0], fault) from error
-        joints: list[LinkJoint] = []
+        couplings, joints = tuple(self._mimics(given)), list[LinkJoint]()
+        self._range(given, couplings)
         for k in order:
             if k in by_child:
                 links[k], made = self._joint(by_child[k][0], links, k, by_child[k][1])
                 joints += made
             elif fixed or links[k].name == WORLD:
                 links[k] = replace(links[k], still=True)
-        couplings = tuple(self._mimics(given))
         left = [f"{what} ({count})" for what, count in self.left.items()]
         return Robot(
             self.root.get("name", self.path.stem), tuple(links), tuple(joints),
@@ -260,12 +265,38 @@ class _Reader:
             if mimic is None:
                 continue
             of = self.text(mimic, "joint")
-            if of not in given or of == name:
+            if of == name:
+                raise self.wrong(mimic, f"{name} cannot follow itself")
+            if of not in given:
                 raise self.wrong(mimic, f"no other joint is called {of!r}{nearest(of, given)}")
             if any(KINDS.get(given[k].get("type", "")) not in ("hinge", "slider") for k in (name, of)):
                 self.left["<mimic> between joints other than hinges and sliders"] += 1
                 continue
             yield name, of, self.number(mimic, "multiplier", 1.0), self.number(mimic, "offset", 0.0)
+
+    def _range(self, given: dict[str, Element], couplings: tuple[tuple[str, str, float, float], ...]) -> None:
+        """Find the limits of hinges and sliders, and where they start, rad or m: at zero, or at the nearest of their
+        limits; one that follows another where it then has to be."""
+        follows = {name: (of, ratio, offset) for name, of, ratio, offset in couplings}
+
+        def start(name: str, after: tuple[str, ...] = ()) -> float:
+            if name in after:
+                raise self.wrong(given[name], f"joints follow each other in a circle: {' -> '.join((*after, name))}")
+            limits = self.limits[name]
+            if name not in follows:
+                return 0.0 if limits is None else min(max(0.0, limits[0]), limits[1])
+            of, ratio, offset = follows[name]
+            return ratio * start(of, (*after, name)) + offset
+
+        turning = [name for name, element in given.items() if KINDS.get(element.get("type", "")) in ("hinge", "slider")]
+        for name in turning:
+            self.limits[name] = self._limits(given[name], name, given[name].get("type", ""))
+        for name in turning:
+            self.start[name] = begin = start(name)
+            if begin:
+                unit = "m" if given[name].get("type") == "prismatic" else "rad"
+                why = "it follows another" if name in follows else "its limits leave zero out"
+                self.notes.append(f"joint {name} starts at {begin:.6g} {unit}: {why}")
 
     def _by_name(self, what: str, elements: Sequence[Element]) -> dict[str, Element]:
         """Links or joints by their names, which differ."""
@@ -434,11 +465,7 @@ class _Reader:
             if KINDS[kind] == "ball" and self.child(element, "limit") is not None:
                 self.left["limits of spherical joints"] += 1
             return replace(links[child], pose=pose), [LinkJoint(kind=KINDS[kind], **held, others=others)]  # type: ignore[arg-type]
-        limits, start = self._limits(element, name, kind), 0.0
-        if limits is not None and not limits[0] <= 0.0 <= limits[1]:
-            start = min(max(0.0, limits[0]), limits[1])
-            unit = "m" if kind == "prismatic" else "rad"
-            self.notes.append(f"joint {name} starts at {start:.6g} {unit}: its limits leave zero out")
+        limits, start = self.limits[name], self.start[name]
         if kind == "prismatic":
             pose = pose_of(start * along) @ pose
         else:

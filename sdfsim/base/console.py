@@ -15,7 +15,7 @@ from functools import partial
 from types import FrameType, TracebackType
 from typing import Any
 
-from sdfsim.base.errors import EXIT_ERROR, EXIT_INTERRUPTED, SceneError, SdfsimError
+from sdfsim.base.errors import EXIT_ERROR, EXIT_INTERRUPTED, SceneError, SdfsimError, printable
 
 _PLAIN_SECONDS = 5.0  # between two plain lines of one stage
 
@@ -114,18 +114,20 @@ class Session:
         self._result = result
         if not self.as_json:
             self._bar.close()
-            self._print("\n".join(_as_lines(plain(result)) if lines is None else lines))
+            self._print("\n".join(map(printable, _as_lines(plain(result)) if lines is None else lines)))
 
     def given(self, *others: str) -> dict[str, Any]:
         """The options of the command except these: those that it passes on unchanged."""
         return {name: value for name, value in self.options.items() if name not in others}
 
     def hold(self, why: str) -> None:
-        """Wait for Ctrl-C or another end of the process, such as `kill`; with --json go on, as a program reads it."""
-        if not self.as_json:
-            self.say(why)
-            with contextlib.suppress(KeyboardInterrupt):
-                threading.Event().wait()
+        """Wait for Ctrl-C or another end of the process, such as `kill`. The report is printed before."""
+        if self.as_json and self._result is not None:
+            self._print(json.dumps(plain(self._result)))
+            self._result = None
+        self.say(why)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()
 
 
 class _Bar:

@@ -133,7 +133,7 @@ def _compose(path: Path, text: str) -> yaml.Node:
         mark, place = getattr(error, "problem_mark", None), getattr(error, "position", None)
         line = mark.line + 1 if mark else text[:place].count("\n") + 1 if place is not None else 1
         why = next((found for name in ("problem", "context", "reason") if (found := getattr(error, name, None))), "")
-        raise SceneError([f"{path}:{line}: not valid YAML: {why or type(error).__name__}"]) from error
+        raise SceneError([f"{path}:{line}: not valid YAML: {why or 'nested too deeply'}"]) from error
     if root is None:
         raise SceneError([f"{path}:1: the file is empty"], "a scene needs at least version and bodies")
     return root

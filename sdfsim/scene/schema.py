@@ -895,6 +895,8 @@ class SceneTable(Table):
         for i, coupling in enumerate(self.couplings):
             for k, name in enumerate(coupling.joints):
                 yield from fits(("couplings", i, "joints", k), name, "hinge", "slider")
+            if len({*coupling.joints}) == 1:
+                yield ("couplings", i, "joints"), f"{coupling.joints[0]!r} cannot follow itself"
 
     def _joint_faults(self) -> Iterator[Fault]:
         motion = {name: self.motion_of(body) for body in self.bodies for name in body.names()}

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Numbers = Sequence[float] | np.ndarray
 SKY = (236, 240, 245)  # RGB
+LARGEST = 16_384  # px, sides of a picture
 _MARGIN = 0.95  # part of the picture that is filled if the camera is chosen automatically
 _SUN = np.array([0.35, -0.5, 0.8])  # to the sun, in a frame with x to the right of the camera and z up
 _SHADE = 0.42  # light in the shadow
@@ -114,8 +115,10 @@ class Camera:
             raise SdfsimError("camera: position and look_at must be two different points")
         if not (np.linalg.norm(self.up) > 0 and 0.0 < self.fov < 180.0):
             raise SdfsimError(f"camera: up must not be zero, and fov between 0 and 180 degrees (got {self.fov:g})")
-        if not (min(self.width, self.height) >= 1 and min(self.focal or (1.0,)) > 0):
-            raise SdfsimError("camera: width, height and focal must be above zero")
+        if not (1 <= min(self.width, self.height) and max(self.width, self.height) <= LARGEST):
+            raise SdfsimError(f"camera: {self.width} x {self.height} px: sides must be 1 to {LARGEST:,}")
+        if not min(self.focal or (1.0,)) > 0:
+            raise SdfsimError("camera: focal must be above zero")
 
     @classmethod
     def posed(

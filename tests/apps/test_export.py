@@ -465,7 +465,7 @@ def test_pybullet_rests_where_we_do(dropped):
     try:
         engine.setGravity(*dropped.scene.gravity)
         found = {}
-        rows = {row["body"]: row for row in csv.DictReader(out.with_suffix(".csv").open())}
+        rows = {row["body"]: row for row in csv.DictReader(out.with_suffix(".poses.csv").open())}
         for name in [body.name for body in dropped.scene.bodies]:
             plain = "_1_box" if name == "1 box" else name.replace(" ", "_")
             row = rows.pop(plain)
@@ -511,7 +511,7 @@ joints:
     engine.connect(engine.DIRECT)
     try:
         places = {}
-        for row in csv.DictReader(out.with_suffix(".csv").open()):
+        for row in csv.DictReader(out.with_suffix(".poses.csv").open()):
             place, turn = [float(row[c]) for c in "xyz"], [float(row[f"q{c}"]) for c in "xyzw"]
             body = engine.loadURDF(str(out.with_name(f"scene.{row['body']}.urdf")), place, turn)
             places[row["body"]] = engine.getBasePositionAndOrientation(body)[0]

@@ -54,7 +54,9 @@ class Look:
         self.corners = vertices[:: max(1, len(vertices) // 500)]
         self.radius = self.ball or float(np.linalg.norm(vertices, axis=1).max())
         self.axis = None if self.ball else _axis_of(shape)
-        self.normal: np.ndarray | None = None  # [3] of the surface on which it lies; it only slides and turns there
+        # normal [3] of the surface on which it lies, so that it only slides and turns there; where it lay at first
+        self.normal: np.ndarray | None = None
+        self.seat, self.turn = np.zeros(3), np.zeros(4)
         self.parts, self.round, self.faces = 1, True, []
         if not self.ball:
             self.part = _parts(Mesh(vertices, shape.mesh.faces))

@@ -201,7 +201,7 @@ def touching_points(convex, matrix, pair, plane, held, gap, n, own, his, reach, 
             kept += 1
     count = kept
     extent = _extent(room, count)
-    if not held and least > gap + BETWEEN_CORNERS * extent + BETWEEN_GAPS * abs(gap):
+    if not plane and not held and least > gap + BETWEEN_CORNERS * extent + BETWEEN_GAPS * abs(gap):
         # Corners or edges meet between the corners of the clipped polygon.
         at = along(own, n, mine)
         put(room.clipped, count, (dot(at, u), dot(at, w), dot(at, n)))

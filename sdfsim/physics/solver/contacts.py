@@ -76,9 +76,8 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
         for k in range(manifolds.count[m]):
             point = manifolds.point[m, k]
             n = three(point, NORMAL)
-            arm, other = met_half_way(
-                between, turn(matrix, a, three(point, FIRST)), turn(matrix, b, three(point, SECOND))
-            )
+            mine, theirs = turn(matrix, a, three(point, FIRST)), turn(matrix, b, three(point, SECOND))
+            arm, other = met_half_way(between, mine, theirs)
             now = _relative(motion.velocity, motion.angular, a, b, arm, other)
             coming = _coming(free, a, b, arm, other)
             free_fall = add(now, coming)
@@ -102,6 +101,8 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 fall = 2.0 * dot(coming, n) / (kick * h) * max(gap, 0.0) * (1.0 - bounce * bounce)
                 square = bounce * bounce * approach * approach + (fall if early else 0.0)
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
+            if rebounds:  # where the surfaces will meet, or met, however far they are from each other now
+                arm, other = mine, theirs
             # An impact is over before a body has turned: the gyroscopic torque acts after it.
             before = dot(free_fall, n) if rebounds else dot(then, n)
             deep = rest = 0.0
@@ -136,10 +137,13 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
             if friction > 0.0:
                 if point[TORSION] < 1.0:
                     arm, other = _drawn_in(matrix, manifolds.point, m, manifolds.count[m], k, a, b, between)
+                if point[TORSION] < 1.0 or rebounds:
                     then = add(
                         _relative(motion.velocity, motion.angular, a, b, arm, other), _coming(free, a, b, arm, other)
                     )
                     then = add(then, _turning(free, a, b, arm, other))
+                # At the end of a step the arms are those before its last move.
+                then = add(then, _bending(motion.angular, a, b, arm, other, h if phase == END else 0.5 * h))
                 one = _tangent(n, along(then, n, -dot(then, n)), vector(rules.options.gravity))
                 drag = three(point, TANGENTIAL)
                 for e in range(1, 3):
@@ -237,6 +241,15 @@ def _coming(free, a, b, arm, other):
 def _turning(free, a, b, arm, other):
     """Change of the relative velocity by the gyroscopic torque."""
     return sub(cross((free[a, 6], free[a, 7], free[a, 8]), arm), cross((free[b, 6], free[b, 7], free[b, 8]), other))
+
+
+@njit(**BARE)
+def _bending(angular, a, b, arm, other, later):
+    """Change of the relative velocity a little `later`, as both arms turn: what sticks to a turntable moves along its
+    circle and not along the tangent. Bounded for bodies that turn far in that time."""
+    one, two = get(angular, a), get(angular, b)
+    mine = scale(cross(one, cross(one, arm)), later / (1.0 + dot(one, one) * later * later))
+    return sub(mine, scale(cross(two, cross(two, other)), later / (1.0 + dot(two, two) * later * later)))
 
 
 @njit(**BARE)

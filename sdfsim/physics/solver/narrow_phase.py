@@ -67,11 +67,12 @@ from sdfsim.physics.solver.vectors import (
     put,
     scale,
     sub,
+    three,
     turn,
     turn_back,
     vector,
 )
-from sdfsim.physics.solver.world import COLUMNS, FIRST, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TORSION
+from sdfsim.physics.solver.world import COLUMNS, FIRST, GAP, KEY, NORMAL, NORMAL_IMPULSE, SECOND, TORSION
 
 SHARES = 16  # groups of pairs, each with its own scratch, that threads take in turn
 SOLIDS, ROUND, SURFACES = range(3)  # the ways in which a pair is tested
@@ -553,6 +554,8 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
         return
     count = round_points(shapes, world, motion, matrix, reach, a, b, 0 if one else 1, found)
     if count == 1 and first == SPHERE and second == SPHERE:
+        if known == 0:
+            _as_they_meet(world, motion, matrix, rules, a, b, found)
         for x in range(COLUMNS):
             if known == 0 or x < NORMAL_IMPULSE or x >= KEY:
                 point[p, 0, x] = found[0, x]
@@ -564,6 +567,29 @@ def _collide_round(shapes, world, motion, matrix, rules, manifolds, scratch, p):
     if count + known > 0:
         known = merged(rules, point, p, known, scratch, count, one or other)
     manifolds.count[p] = known
+
+
+@njit(**BARE)
+def _as_they_meet(world, motion, matrix, rules, a, b, found):
+    """Turn the normal of two balls that hit each other to where they touch first, before or after the present poses:
+    in an inner step they may move by a large part of their radius."""
+    n, h = three(found[0], NORMAL), rules.substep_dt
+    speed = sub(get(motion.velocity, a), get(motion.velocity, b))
+    away, other = turn(matrix, a, three(found[0], FIRST)), turn(matrix, b, three(found[0], SECOND))
+    centres = sub(along(other, n, found[0, GAP]), away)  # from the second to the first
+    reach, square, closing = norm(centres) - found[0, GAP], dot(speed, speed), dot(centres, speed)
+    root = closing * closing - square * (dot(centres, centres) - reach * reach)
+    if -dot(speed, n) <= rules.slow or root <= 0.0:
+        return
+    span = (-closing - math.sqrt(root)) / square
+    if abs(span) > h:
+        return
+    m = scale(along(centres, speed, span), 1.0 / reach)
+    mine = add(get(world.com, a), three(found[0], FIRST))
+    theirs = add(get(world.com, b), three(found[0], SECOND))
+    mine = sub(turn_back(matrix, a, scale(m, -norm(mine))), get(world.com, a))
+    theirs = sub(turn_back(matrix, b, scale(m, norm(theirs))), get(world.com, b))
+    write(found, 0, 0, mine, theirs, m, dot(centres, m) - reach, found[0, KEY])
 
 
 @njit(**BARE)
