@@ -114,9 +114,7 @@ def test_what_is_no_scene_source_or_rollout_is_refused_with_what_is_wanted(act, 
 
 
 @pytest.mark.parametrize("count", [0.5, -1, "3", None, True])
-def test_steps_are_whole_numbers(count):
-    sim = Simulator(box())
+@pytest.mark.parametrize("act", [lambda sim, count: sim.step(count), lambda sim, count: next(sim.steps(count))])
+def test_steps_are_whole_numbers(count, act):
     with pytest.raises(SdfsimError, match="steps: must be a whole number"):
-        sim.step(count)
-    with pytest.raises(SdfsimError, match="steps: must be a whole number"):
-        next(sim.steps(count))
+        act(Simulator(box()), count)
