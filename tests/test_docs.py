@@ -137,16 +137,17 @@ def test_pages_are_few_and_short():
     assert (ROOT / "README.md").stat().st_size <= 6500
 
 
-def test_pages_say_what_holds_today():
-    """Days and earlier versions are in records and in the log of commits."""
-    days = re.compile(r"\b\d{1,2} (January|February|November|December)\b|earlier version|not kept|used to ", re.I)
-    assert not [(page.name, found[0]) for page in PAGES for found in days.finditer(page.read_text(encoding="utf-8"))]
-
-
-def test_no_line_begins_with_a_number_of_a_record():
-    """Markdown takes a line that begins with a comment for HTML, and shows the rest of it as it is."""
-    begun = re.compile(r"^[ >]*<!-- \w+\S*\[.*?-->\S", re.MULTILINE)
-    assert not [(page.name, found[0]) for page in PAGES for found in begun.finditer(page.read_text(encoding="utf-8"))]
+@pytest.mark.parametrize(
+    "pattern",
+    [r"(?i)\b\d{1,2} (January|February|November|December)\b|earlier version|not kept|used to ",
+     r"(?m)^[ >]*<!-- \w+\S*\[.*?-->\S"],
+    ids=["days", "numbers"],
+)  # fmt: skip
+def test_pages_say_what_holds_today_and_begin_no_line_with_a_number_of_a_record(pattern):
+    """Days and earlier versions are in records and in the log of commits; Markdown takes a line that begins with a
+    comment for HTML, and shows the rest of it as it is."""
+    texts = {page.name: page.read_text(encoding="utf-8") for page in PAGES}
+    assert not [(name, found[0]) for name, text in texts.items() for found in re.finditer(pattern, text)]
 
 
 def test_presets_and_recipes_in_documents_exist():

@@ -122,13 +122,13 @@ def test_which_of_many_recordings_is_meant_is_said(folder):
     np.savez(folder / "many.npz", **many, dt=DT, start=[0, COUNT, 2 * COUNT])
     scene = folder / "scene.yaml"
     assert load_beside(folder / "many.npz[1]", scene).position[0, 0] == pytest.approx(place[0] + 1.0)
-    with pytest.raises(SdfsimError, match=r"many\.npz: 2 recordings") as told:
-        load_beside(folder / "many.npz", scene)
-    assert "many.npz[0]" in str(told.value.hint)
-    with pytest.raises(SdfsimError, match=r"many\.npz\[2\]: there are 2 recordings"):
-        load_beside(folder / "many.npz[2]", scene)
-    with pytest.raises(SdfsimError, match="nothing"):
-        load_beside(folder / "nothing.npz[0]", scene)
+    for name, told in (
+        ("many.npz", r"many\.npz: 2 recordings.*\nhint: .*many\.npz\[0\]"),
+        ("many.npz[2]", r"many\.npz\[2\]: there are 2 recordings"),
+        ("nothing.npz[0]", "nothing"),
+    ):
+        with pytest.raises(SdfsimError, match=told):
+            load_beside(folder / name, scene)
 
 
 def test_a_run_is_laid_beside_another(folder):

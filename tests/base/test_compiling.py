@@ -23,13 +23,19 @@ def loaded(file: Path):
     return module.double
 
 
-@pytest.mark.parametrize("cache", ["True", "False"])
-def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, caplog, cache):
-    (tmp_path / f"doubling_{cache}.py").write_text(SOURCE.replace("True", cache))
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """A folder of modules whose compiled code is kept below it, of which nothing is ready yet."""
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
     monkeypatch.setattr(compiling, "_ready", set())
+    return tmp_path
+
+
+@pytest.mark.parametrize("cache", ["True", "False"])
+def test_what_is_run_is_what_another_process_has_kept(kept, caplog, cache):
+    (kept / f"doubling_{cache}.py").write_text(SOURCE.replace("True", cache))
     double = importlib.import_module(f"doubling_{cache}").double
     compile_before([(double, (typeof(3),))], "doubling")
     assert caplog.messages == ["compiling doubling, once for this version: about 20 s"]
@@ -37,13 +43,9 @@ def test_what_is_run_is_what_another_process_has_kept(tmp_path, monkeypatch, cap
     assert (sum(double.stats.cache_hits.values()), len(double.stats.cache_misses)) == (1, 0) or cache == "False"
 
 
-def test_a_form_for_other_types_is_told_though_one_is_compiled(tmp_path, monkeypatch, caplog):
+def test_a_form_for_other_types_is_told_though_one_is_compiled(kept, caplog):
     """Arrays of another layout need code of their own, which used to be compiled without a word."""
-    (tmp_path / "layouts.py").write_text(SOURCE)
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
-    monkeypatch.setattr(compiling, "_ready", set())
+    (kept / "layouts.py").write_text(SOURCE)
     double, before = importlib.import_module("layouts").double, compiling.seconds_spent()
     for array, told in ((np.ones((2, 2)), 1), (np.zeros((3, 3)), 1), (np.ones((4, 4))[::2], 2), (np.ones((2, 2)), 2)):
         compile_before([(double, (typeof(array),))], "doubling")

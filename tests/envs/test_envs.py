@@ -119,13 +119,17 @@ def test_a_heavy_body_is_pushed_too():
     assert pushed(beside(0.0)).mean() >= 0.75
 
 
-def test_wrong_input_is_one_clear_line(tmp_path):
-    with pytest.raises(SdfsimError, match="obs_type: must be one of state, pixels"):
-        sdfsim.envs.Push(1, obs_type="rgb")
-    with pytest.raises(SdfsimError, match="body: 'cup' is none that moves"):
-        sdfsim.envs.Push(1, body="cup")
-    with pytest.raises(SdfsimError, match=r"actions: must be \[2, 2\] \(got \[2\]\)"):
-        sdfsim.envs.Push(2).step(np.zeros(2))
+@pytest.mark.parametrize(
+    ("act", "told"),
+    [
+        (lambda: sdfsim.envs.Push(1, obs_type="rgb"), "obs_type: must be one of state, pixels"),
+        (lambda: sdfsim.envs.Push(1, body="cup"), "body: 'cup' is none that moves"),
+        (lambda: sdfsim.envs.Push(2).step(np.zeros(2)), r"actions: must be \[2, 2\] \(got \[2\]\)"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(act, told):
+    with pytest.raises(SdfsimError, match=told):
+        act()
 
 
 def test_sdfsim_itself_does_not_load_gymnasium():

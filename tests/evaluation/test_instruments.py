@@ -177,15 +177,18 @@ def test_what_is_beside_a_seam_folded_flat_is_not_in_the_body(first, below):
     assert inside.apart[0] == pytest.approx(-0.005, abs=1e-4)
 
 
-def test_a_body_swallowed_by_another_is_deep_in_it():
-    found = between(BALL, CUBE, [0.0, 0.0, 0.1], Rotation.identity(), scale=(4.0, 1.0))
-    # The cube's point that is nearest to the centre of the ball of 1 m lies at z = 0.05.
-    assert found.apart[0] == pytest.approx(-0.95, abs=1e-3)
-
-
-def test_scales_count():
-    found = between(CUBE, CUBE, [0.0, 0.0, 0.2], about("z", 30), scale=(2.0, 1.0))
-    assert found.apart[0] == pytest.approx(0.05, abs=1e-5)
+@pytest.mark.parametrize(
+    ("first", "height", "turn", "scale", "apart", "within"),
+    [
+        # The cube's point that is nearest to the centre of the ball of 1 m lies at z = 0.05.
+        (BALL, 0.1, Rotation.identity(), 4.0, -0.95, 1e-3),
+        (CUBE, 0.2, about("z", 30), 2.0, 0.05, 1e-5),
+    ],
+    ids=["swallowed", "above"],
+)
+def test_scales_count_and_a_body_swallowed_by_another_is_deep_in_it(first, height, turn, scale, apart, within):
+    found = between(first, CUBE, [0.0, 0.0, height], turn, scale=(scale, 1.0))
+    assert found.apart[0] == pytest.approx(apart, abs=within)
 
 
 # --- overlap ---

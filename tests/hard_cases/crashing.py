@@ -321,11 +321,11 @@ def falling(seed: int) -> Trajectory:
 
 def write_cubes(folder: Path) -> None:
     """A dataset of one trajectory a split."""
-    analytic_shape("box", size=(1, 1, 1), name="cube").save(folder / "shapes" / "cube")
-    for split, seed in (("train", 0), ("validation", 1)):
-        (folder / split).mkdir()
-        falling(seed).save(folder / split / "00000.npz")
-    (folder / "dataset.json").write_text('{"recipe": "cubes", "seed": 0}')
+    from tests.helpers.recordings import write_dataset  # here, as it loads what the processes that end do not need
+
+    cube = analytic_shape("box", size=(1, 1, 1), name="cube")
+    splits = {"train": [falling(0)], "validation": [falling(1)]}
+    write_dataset(folder, cube, splits, {"recipe": "cubes", "seed": 0})
 
 
 @pytest.fixture(scope="session")

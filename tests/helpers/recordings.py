@@ -9,6 +9,7 @@ import pytest
 
 from sdfsim.data.dataset import Trajectory
 from sdfsim.shape.make import analytic_shape
+from sdfsim.shape.shape import Shape
 from sdfsim.training import train as train_module
 from sdfsim.training.presets import Preset
 
@@ -97,14 +98,25 @@ def sliding(friction: float, **fields) -> Trajectory:
     return replace(one, **(own | fields))
 
 
-def slab_data(folder: Path, split: str, trajectory: Trajectory, info: dict | None) -> Path:
-    """A dataset of one trajectory of slabs; `info` is its dataset.json, None for none."""
-    analytic_shape("box", size=(1.0, 1.0, 0.2), name="slab").save(folder / "shapes" / "slab")
-    (folder / split).mkdir()
-    trajectory.save(folder / split / "0.npz")
+def write_dataset(folder: Path, shape: Shape, splits: dict[str, list[Trajectory]], info: dict | None) -> Path:
+    """A dataset of one shape and of the trajectories of each split; `info` is its dataset.json, None for none."""
+    shape.save(folder / "shapes" / shape.name)
+    for split, trajectories in splits.items():
+        (folder / split).mkdir()
+        for k, one in enumerate(trajectories):
+            one.save(folder / split / f"{k}.npz")
     if info is not None:
         (folder / "dataset.json").write_text(json.dumps(info))
     return folder
+
+
+BALL, BALLS = analytic_shape("sphere", radius=0.5, name="ball"), {"recipe": "balls", "seed": 0}
+
+
+def slab_data(folder: Path, split: str, trajectory: Trajectory, info: dict | None) -> Path:
+    """A dataset of one trajectory of slabs."""
+    slab = analytic_shape("box", size=(1.0, 1.0, 0.2), name="slab")
+    return write_dataset(folder, slab, {split: [trajectory]}, info)
 
 
 @pytest.fixture(scope="module")
@@ -131,14 +143,8 @@ def cube_data(cube_meshes, tmp_path_factory):
 @pytest.fixture(scope="module")
 def ball_data(tmp_path_factory):
     """A dataset folder with two splits of thrown balls."""
-    folder = tmp_path_factory.mktemp("balls")
-    analytic_shape("sphere", radius=0.5, name="ball").save(folder / "shapes" / "ball")
-    for split, count in (("train", 6), ("validation", 2)):
-        (folder / split).mkdir()
-        for k in range(count):
-            bouncing(k + 100 * (split == "validation")).save(folder / split / f"{k}.npz")
-    (folder / "dataset.json").write_text('{"recipe": "balls", "seed": 0}')
-    return folder
+    thrown = {"train": [bouncing(k) for k in range(6)], "validation": [bouncing(100), bouncing(101)]}
+    return write_dataset(tmp_path_factory.mktemp("balls"), BALL, thrown, BALLS)
 
 
 @pytest.fixture(scope="module")

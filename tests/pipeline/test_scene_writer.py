@@ -29,18 +29,16 @@ from sdfsim.scene.load import load_scene
 from sdfsim.sdf.grid import GridSdf
 from sdfsim.shape.make import analytic_shape
 from sdfsim.shape.shape import Shape, load_shape
-from tests.helpers.surfaces import cube, scenery
+from tests.helpers.surfaces import cube, plate, scenery
 
 PLACEMENT = Placement(Similarity(1.0, np.eye(3), np.zeros(3)), "plane", "assumed: widest side = 1 m", size_assumed=True)
 
 
 def terrain(height) -> Mesh:
     """The surface z = height(x, y) over [-0.5, 0.5]^2, 1 cm apart."""
-    line = np.linspace(-0.5, 0.5, 101)
-    x, y = np.meshgrid(line, line, indexing="ij")
-    corner = (np.arange(100)[:, None] * 101 + np.arange(100)).ravel()
-    faces = np.concatenate([corner[:, None] + [0, 101, 102], corner[:, None] + [0, 102, 1]])
-    return Mesh(np.stack([x, y, height(x, y)], -1).reshape(-1, 3), faces)
+    flat = plate(100)
+    x, y, _ = flat.vertices.T
+    return Mesh(np.stack([x, y, height(x, y)], -1), flat.faces)
 
 
 def test_drop_lands_on_the_block():

@@ -380,14 +380,10 @@ def test_each_lens_is_colmaps_in_every_format(tmp_path, model, kind, projected):
     np.testing.assert_allclose(found, view.project(points)[0], atol=1e-6)
 
 
-def scanned(folder: Path, *others: str) -> Path:
-    """Photos as a phone's scanner writes them, and pictures of the same numbers with other names."""
-    noise(folder, [f"frame_{k:05d}.jpg" for k in range(4)])
-    return noise(folder, [f"{name}_{k:05d}.png" for name in others for k in range(4)])
-
-
 def test_depth_and_confidence_among_the_photos_are_named_and_not_used(tmp_path):
-    source = find_source(scanned(tmp_path, "depth", "conf"))
+    """As a phone's scanner writes them: with the numbers of the photos."""
+    names = ("frame_{:05d}.jpg", "depth_{:05d}.png", "conf_{:05d}.png")
+    source = find_source(noise(tmp_path, [name.format(k) for name in names for k in range(4)]))
     assert [path.name for path in source.photos] == [f"frame_{k:05d}.jpg" for k in range(4)] and not source.masks
     assert source.notes == (
         "4 pictures are confidence of photos, by their names (first: conf_00000.png): they are not used",
@@ -440,35 +436,26 @@ def test_of_several_models_the_largest_is_used_and_all_are_named(tmp_path, given
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "program", "instead"),
+    ("name", "content", "says", "instead"),
     [
         ("sfm_data.json", {"sfm_data_version": "0.3", "views": [], "extrinsics": []}, "OpenMVG", "openMVG2Colmap"),
         ("reconstruction.json", [{"cameras": {}, "shots": {"a.jpg": {}}}], "OpenSfM", "export_colmap"),
         ("camera_models.json", {"v2 x": {"projection_type": "perspective", "width": 1}}, "OpenSfM", "export_colmap"),
         ("cameras.json", [{"id": 0, "img_name": "a", "position": [0, 0, 0]}], "3D Gaussian splatting", "sparse/0"),
         ("sfm.json", {"version": ["1", "2"], "views": [], "intrinsics": []}, "Meshroom", "COLMAP"),
+        ("c.json", {"points": [], "colors": []}, "it has no `frames`, but colors, points", ""),
+        ("c.json", [], "it has no `frames`, but nothing", ""),
+        ("c.json", {"fl_x": 1, "w": 1, "h": 1, "frames": [{"file_path": "a"}]}, "it has no 'transform_matrix'", ""),
     ],
 )  # fmt: skip
-def test_cameras_of_other_programs_are_named_with_what_to_give(tmp_path, name, content, program, instead):
+def test_json_files_of_other_programs_are_named_with_what_to_give_or_told_what_they_lack(
+    tmp_path, name, content, says, instead
+):
     (tmp_path / name).write_text(json.dumps(content))
-    with pytest.raises(SdfsimError, match=f"{name}: is a file of {program}") as caught:
+    with pytest.raises(SdfsimError, match=f"{name}: is a file of {says}" if instead else says) as caught:
         find_source(tmp_path / name)
     assert instead in caught.value.hint and "transforms.json" in caught.value.hint
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        ({"points": [], "colors": []}, "it has no `frames`, but colors, points"),
-        ([], "it has no `frames`, but nothing"),
-        ({"fl_x": 1, "w": 1, "h": 1, "frames": [{"file_path": "a"}]}, "it has no 'transform_matrix'"),
-    ],
-)
-def test_other_json_files_are_told_what_they_lack(tmp_path, content, says):
-    (tmp_path / "c.json").write_text(json.dumps(content))
-    with pytest.raises(SdfsimError, match=says) as caught:
-        find_source(tmp_path / "c.json")
-    assert "transforms.json" in caught.value.hint and "KeyError" not in str(caught.value)
+    assert "KeyError" not in str(caught.value)
 
 
 NUMBERED = ["0.jpg", "1.jpg", "2.jpg"]

@@ -257,19 +257,21 @@ def off(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(found @ true, -1, 1))))
 
 
-@pytest.mark.parametrize("yaws", [np.zeros(30), np.linspace(0, 5, 30), np.repeat([0, np.pi], 15)])
-def test_cameras_that_look_straight_down_on_a_desk_have_it_below_them(yaws):
-    """However they were turned about their axes: one way, all ways, or there and back as drones do."""
-    mesh, views, up = in_some_world(desk(), downwards(yaws))
+@pytest.mark.parametrize(
+    ("things", "cameras", "within"),
+    [
+        (desk(), downwards(np.zeros(30)), 30), (desk(), downwards(np.linspace(0, 5, 30)), 30),
+        (desk(), downwards(np.repeat([0, np.pi], 15)), 30), (shelf(), rail(0.4), 3),
+    ],
+    ids=["one way", "all ways", "there and back", "shelf"],
+)  # fmt: skip
+def test_cameras_straight_above_a_desk_have_it_below_them_and_level_ones_a_shelf_s_boards_level(
+    things, cameras, within
+):
+    """However those above were turned about their axes: one way, all ways, or there and back as drones do."""
+    mesh, views, up = in_some_world(things, cameras)
     found = find_up(mesh, views)
-    assert off(found.direction, up) < 1 and found.source == "plane"
-    assert found.within < 30
-
-
-def test_level_cameras_before_a_shelf_have_its_boards_level():
-    mesh, views, up = in_some_world(shelf(), rail(0.4))
-    found = find_up(mesh, views)
-    assert off(found.direction, up) < 1 and found.source == "plane" and found.within < 3
+    assert off(found.direction, up) < 1 and found.source == "plane" and found.within < within
 
 
 def test_a_wall_alone_is_upright_but_may_be_a_floor():
@@ -363,21 +365,17 @@ def test_two_pixels_with_a_known_distance_set_the_scale(views, photos):
     assert scale[1] == f"given: {known[0]} to {known[1]} = {known[2]:g} m"
 
 
-def test_a_pixel_just_beside_a_corner_means_the_corner(views, photos):
+@pytest.mark.parametrize(("side", "farther", "within"), [(1.0, 1.02, 0.03), (0.98, 1.0, 0.005)])
+def test_a_pixel_beside_a_corner_means_the_corner_and_one_that_came_out_rounded_is_where_it_was_pointed_at(
+    views, photos, side, farther, within
+):
+    """A little farther out than the corners of the cube; or they came out by a hundredth too far inside."""
     wall = cube(30.0, (0.0, 0, -15.6))  # Far below and behind the cube: most rays that miss it end there.
-    surface = Caster(joined([cube(1.0), wall]))
-    # Left and right as the camera sees them, and a little farther out.
+    surface = Caster(joined([cube(side), wall]))
+    # Left and right as the camera sees them.
     corners = np.array([[0.5, -0.5, 0.5], [-0.5, 0.5, 0.5]])
-    known = [*(clicked(views[1], corner * [1.02, 1.02, 1]) for corner in corners), np.sqrt(2) * METRES]
-    assert measured_scale(known, views, photos, surface)[0] == pytest.approx(METRES, rel=0.03)
-
-
-def test_corners_that_came_out_rounded_are_where_they_were_pointed_at(views, photos):
-    wall = cube(30.0, (0.0, 0, -15.6))
-    surface = Caster(joined([cube(0.98), wall]))  # corners by a hundredth too far inside
-    corners = np.array([[0.5, -0.5, 0.5], [-0.5, 0.5, 0.5]])
-    known = [*(clicked(views[1], corner) for corner in corners), np.sqrt(2) * METRES]
-    assert measured_scale(known, views, photos, surface)[0] == pytest.approx(METRES, rel=0.005)
+    known = [*(clicked(views[1], corner * [farther, farther, 1]) for corner in corners), np.sqrt(2) * METRES]
+    assert measured_scale(known, views, photos, surface)[0] == pytest.approx(METRES, rel=within)
 
 
 def test_a_photo_without_a_pixel_is_its_camera(views, photos):

@@ -47,18 +47,19 @@ def test_the_sharpest_frame_of_each_stretch_is_taken(tmp_path):
     assert not any(p.fault for p in photos) and notes == []
 
 
-def test_a_film_without_motion_is_refused_with_the_reason(tmp_path):
-    film(tmp_path / "a.mp4", np.full(60, 100))
-    with pytest.raises(SdfsimError, match="hardly moves") as caught:
+@pytest.mark.parametrize(
+    ("places", "told", "code", "hint"),
+    [
+        (np.full(60, 100), "hardly moves", EXIT_QUALITY, ""),
+        (np.arange(12) * 6, "a clip of only 12 frames", 1, "film for longer"),
+    ],
+    ids=["still", "short"],
+)
+def test_a_film_without_motion_and_a_short_clip_are_refused_with_the_reason(tmp_path, places, told, code, hint):
+    film(tmp_path / "a.mp4", places)
+    with pytest.raises(SdfsimError, match=told) as caught:
         prepare_photos(tmp_path / "a.mp4", tmp_path)
-    assert caught.value.exit_code == EXIT_QUALITY
-
-
-def test_a_short_clip_is_told_to_be_short(tmp_path):
-    film(tmp_path / "a.mp4", np.arange(12) * 6)
-    with pytest.raises(SdfsimError, match="a clip of only 12 frames") as caught:
-        prepare_photos(tmp_path / "a.mp4", tmp_path)
-    assert "film for longer" in caught.value.hint and "convert" not in caught.value.hint
+    assert caught.value.exit_code == code and hint in caught.value.hint and "convert" not in caught.value.hint
 
 
 def test_what_is_no_video_is_named(tmp_path, capfd):

@@ -41,15 +41,6 @@ def test_everything_is_on_where_it_matters(scene):
     assert decided["gravity"].on and decided["sleep"].on
 
 
-def may_touch(a: Body, b: Body) -> bool:
-    """True when both bodies list each other (or all), and at least one of them is dynamic."""
-    if "dynamic" not in (a.motion, b.motion):
-        return False
-    return (a.collides_with is None or b.name in a.collides_with) and (
-        b.collides_with is None or a.name in b.collides_with
-    )
-
-
 def test_what_a_body_avoids_it_does_not_touch_and_all_else_it_does():
     """By name, copies too; whichever of two bodies says so, and beside a list of partners."""
     scene = SceneBuilder().add("floor", plane={}).add("a", sphere={"radius": 0.1}, avoids=["many"])
@@ -81,7 +72,9 @@ def test_groups_and_counts_say_what_every_single_pair_says(scene):
     found = {"possible": 0, "frictional": 0, "bouncy": 0, "unmoved": 0}
     for i, x in enumerate(bodies):
         for j, y in enumerate(bodies[i + 1 :], i + 1):
-            moves, touch = "dynamic" in (x.motion, y.motion), may_touch(x, y)
+            moves = "dynamic" in (x.motion, y.motion)
+            # At least one is dynamic, and each lists the other, or all.
+            touch = moves and all(a.collides_with is None or b.name in a.collides_with for a, b in ((x, y), (y, x)))
             assert touch == (moves and bool(allowed[group[i], group[j]]))
             found["possible"] += touch
             found["unmoved"] += not moves

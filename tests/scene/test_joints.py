@@ -80,20 +80,22 @@ def test_a_fault_of_a_joint_is_told_with_its_line(load, joint: str, told: str):
     )
 
 
-def test_joints_of_one_name_are_refused(load):
-    text = (
-        TOP + "  - {name: a, type: fixed, bodies: [leaf, world]}\n  - {name: a, type: fixed, bodies: [crate, leaf]}\n"
-    )
-    assert problems_of(load, text) == [
-        "scene.yaml:11: joints[1].name: two joints are called 'a' (the first is joints[0])"
-    ]
-
-
-def test_a_body_that_is_called_world_cannot_be_meant(load):
-    text = TOP.replace("name: crate,", "name: world,") + "  - {name: a, type: fixed, bodies: [leaf, world]}\n"
-    assert problems_of(load, text) == [
-        "scene.yaml:10: joints[0].bodies[1]: a body is called 'world' too: give it another name"
-    ]
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (
+            TOP
+            + "  - {name: a, type: fixed, bodies: [leaf, world]}\n  - {name: a, type: fixed, bodies: [crate, leaf]}\n",
+            "scene.yaml:11: joints[1].name: two joints are called 'a' (the first is joints[0])",
+        ),
+        (
+            TOP.replace("name: crate,", "name: world,") + "  - {name: a, type: fixed, bodies: [leaf, world]}\n",
+            "scene.yaml:10: joints[0].bodies[1]: a body is called 'world' too: give it another name",
+        ),
+    ],
+)
+def test_joints_of_one_name_and_a_body_that_is_called_world_are_refused(load, text, told):
+    assert problems_of(load, text) == [told]
 
 
 def test_a_hinge_has_a_frame_at_each_body(load):

@@ -79,6 +79,7 @@ TOP = [
     ("shapes: {cup: {sphere: {radius: 1}, units: cm}}", "shapes.cup.units: is for mesh only"),
     ("shapes: {cup: {plane: {}, wall: 0.01}}", "shapes.cup.wall: is not for a plane"),
     ("shapes: {cup: {sphere: {radius: 1}, sdf: grid}}", "shapes.cup.sdf: is for asset, mesh, primitive only"),
+    ("shapes: {cup: {sphere: {radius: 1}, centre: on}}", "shapes.cup.centre: is for asset, mesh, primitive only"),
     ("shapes: {cup: {primitive: {name: box}, resolution: 64}}", "shapes.cup.resolution: is for sdf: grid only"),
     ("shapes: {cup: {primitive: {name: tours}}}", "shapes.cup.primitive.name: no such primitive: 'tours'"),
 ]
@@ -108,17 +109,15 @@ def test_every_fault_is_reported_at_once_in_file_order(load):
     ]
 
 
-def test_missing_files(tmp_path):
-    with pytest.raises(SceneError, match="no such file"):
-        load_scene(tmp_path / "scene.yaml")
-    with pytest.raises(SceneError, match="cannot be read"):
-        load_scene(tmp_path)
-    (tmp_path / "scene.yaml").write_bytes(b"version: 1\n\xff\xfe")
-    with pytest.raises(SceneError, match=r"scene\.yaml:2: not UTF-8 text"):
-        load_scene(tmp_path / "scene.yaml")
-    (tmp_path / "scene.yaml").write_text("[" * 5_000)
-    with pytest.raises(SceneError, match="not valid YAML"):
-        load_scene(tmp_path / "scene.yaml")
+def test_what_is_missing_or_no_scene_file_is_refused(tmp_path):
+    (tmp_path / "bytes.yaml").write_bytes(b"version: 1\n\xff\xfe")
+    (tmp_path / "deep.yaml").write_text("[" * 5_000)
+    for name, told in (
+        ("scene.yaml", "no such file"), (".", "cannot be read"), ("bytes.yaml", r"bytes\.yaml:2: not UTF-8 text"),
+        ("deep.yaml", "not valid YAML"),
+    ):  # fmt: skip
+        with pytest.raises(SceneError, match=told):
+            load_scene(tmp_path / name)
 
 
 def test_a_broken_asset_is_reported_at_its_line(load, tmp_path):

@@ -130,12 +130,6 @@ def test_an_origin_far_off_is_told(tmp_path, caplog):
     assert scene.shapes[0].com == pytest.approx(FAR)
 
 
-def test_a_closed_form_is_about_its_centre_anyway(load):
-    text = "version: 1\nshapes: {it: {sphere: {radius: 1}, centre: on}}\nbodies: [{name: a, shape: it}]\n"
-    with pytest.raises(SceneError, match="centre: is for asset, mesh, primitive only"):
-        load(text)
-
-
 TURN, SHIFT = Rotation.from_euler("xyz", [90, 20, 0], degrees=True), np.array([0.02, 0.03, -0.01])
 
 
@@ -268,18 +262,14 @@ bodies:
 """
 
 
-@pytest.fixture
-def no_fit(monkeypatch):
-    monkeypatch.setattr("sdfsim.shape.make.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
-
-
 def heights(scene: Scene) -> np.ndarray:
     """[15, 3, 3] m: where the bodies are, step by step."""
     simulator = Simulator(scene, model="solver")
     return np.stack([np.asarray(state.position) for state in simulator.steps(15)])
 
 
-def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, no_fit):
+def test_a_ball_bounces_alike_off_a_box_a_grid_and_a_mesh(load, tmp_path, monkeypatch):
+    monkeypatch.setattr("sdfsim.shape.make.fit_mesh", lambda *args, **kwargs: pytest.fail("fitted"))
     crate = analytic_shape("box", size=(0.4, 0.4, 0.4))
     crate.save(tmp_path / "crate")
     larger = replace(crate.mesh, vertices=100 * crate.mesh.vertices)
@@ -325,19 +315,3 @@ def test_a_shape_of_parts_has_their_mass_and_rests_on_them(tmp_path):
     assert rollout.position[-1, 1] == pytest.approx(rollout.position[0, 1], abs=2e-4)
     again = sdfsim.Scene.read(tmp_path / "scene.yaml", allow_outside=True).load()
     assert again.bodies[1].mass == pytest.approx(mass)
-
-
-@pytest.mark.parametrize(
-    ("parts", "told"),
-    [
-        ([{"box": {"size": (1, 1, 1)}, "scale": 2}], "parts[0].scale: is for a mesh only"),
-        ([{"box": {"size": (1, 1, 1)}, "use": "shown"}], "parts: one part must not be use: shown"),
-        ([{"position": (0, 0, 1)}], "parts[0]: one of mesh, sphere, capsule, cylinder, box is required"),
-        ([{"capsule": {"radius": 1, "height": 1}}], "parts[0].capsule.height: must be above twice the radius"),
-        ([{"mesh": "none.obj"}], "parts[0].mesh: no such file"),
-    ],
-)
-def test_parts_that_make_no_shape_are_told(parts, told):
-    with pytest.raises(SceneError) as caught:
-        sdfsim.Scene().add("a", parts=parts)
-    assert any(told in problem for problem in caught.value.problems)

@@ -39,11 +39,20 @@ def test_a_scene_written_in_python_is_that_of_its_file(tmp_path):
     assert "../" in file.read_text()  # the path of the ring starts at the folder of the file
 
 
-def test_unknown_keys_are_reported_at_once():
-    with pytest.raises(SceneError, match=r"body 'a': unknown key 'sphre' \(did you mean 'sphere'\?\)"):
-        sdfsim.Scene().add("a", sphre={"radius": 1})
-    with pytest.raises(SceneError, match=r"a scene: unknown key 'gravitiy' \(did you mean 'gravity'\?\)"):
-        sdfsim.Scene(gravitiy=(0, 0, 0))
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: sdfsim.Scene().add("a", sphre={"radius": 1}),
+         r"body 'a': unknown key 'sphre' \(did you mean 'sphere'\?\)"),
+        (lambda: sdfsim.Scene(gravitiy=(0, 0, 0)), r"a scene: unknown key 'gravitiy' \(did you mean 'gravity'\?\)"),
+        (lambda: sdfsim.Scene().add("a", sphere={"radius": 1}).add("a", sphere={"radius": 2}),
+         "body 'a': two bodies have this name"),
+        (lambda: sdfsim.Scene(duration=-1), r"a scene: duration: must be > 0 \(got -1 s\)"),
+    ],
+)  # fmt: skip
+def test_unknown_keys_wrong_settings_and_two_bodies_of_one_name_are_refused_at_once(make, told):
+    with pytest.raises(SceneError, match=told):
+        make()
 
 
 @pytest.mark.parametrize(
@@ -60,6 +69,12 @@ def test_unknown_keys_are_reported_at_once():
         ({"shape": "b", "rotation": (0, 0, 90)}, ["'rotation' (give quat_xyzw, quat_wxyz or euler_xyz_deg)"]),
         ({"shape": "b", "motion": "moving"}, ["motion: must be one of static, dynamic, kinematic (got 'moving')"]),
         ({}, ["body 'a': one of shape, plane is required"]),
+        ({"parts": [{"box": {"size": (1, 1, 1)}, "scale": 2}]}, ["parts[0].scale: is for a mesh only"]),
+        ({"parts": [{"box": {"size": (1, 1, 1)}, "use": "shown"}]}, ["parts: one part must not be use: shown"]),
+        ({"parts": [{"position": (0, 0, 1)}]}, ["parts[0]: one of mesh, sphere, capsule, cylinder, box is required"]),
+        ({"parts": [{"capsule": {"radius": 1, "height": 1}}]}, [
+            "parts[0].capsule.height: must be above twice the radius"]),
+        ({"parts": [{"mesh": "none.obj"}]}, ["parts[0].mesh: no such file"]),
     ],
 )  # fmt: skip
 def test_a_wrong_body_is_refused_where_it_is_added(keys, told):
@@ -88,13 +103,6 @@ def test_a_wrong_joint_is_refused_where_it_is_added(kind, keys, told):
     with pytest.raises(SceneError) as caught:
         sdfsim.Scene().join("j", kind, "a", **keys)
     assert any(told in problem for problem in caught.value.problems)
-
-
-def test_two_bodies_of_one_name_and_settings_are_refused():
-    with pytest.raises(SceneError, match="body 'a': two bodies have this name"):
-        sdfsim.Scene().add("a", sphere={"radius": 1}).add("a", sphere={"radius": 2})
-    with pytest.raises(SceneError, match=r"a scene: duration: must be > 0 \(got -1 s\)"):
-        sdfsim.Scene(duration=-1)
 
 
 def test_missing_bodies_are_told_beside_other_faults_and_with_those_that_there_are(tmp_path):

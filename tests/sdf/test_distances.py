@@ -139,14 +139,27 @@ def test_empty_chunked_and_numpy_questions(monkeypatch: pytest.MonkeyPatch) -> N
     assert sdf(points.double().numpy())[0].dtype == np.float64
 
 
-def test_grids_that_cannot_be_are_refused() -> None:
-    with pytest.raises(SdfsimError, match="two samples"):
-        ball(1)
-    with pytest.raises(SdfsimError, match="no extent"):
-        sample_grid(SphereSdf(0.5), np.array([[-np.inf] * 3, [np.inf] * 3]), 8)
-    for shape in ((4, 4, 5), (4, 4), (1, 1, 1)):
-        with pytest.raises(ValueError, match="equal numbers of samples"):
-            GridSdf(torch.zeros(shape), Frame(np.zeros(3), 1.0), BOUNDS)
+@pytest.mark.parametrize(
+    ("make", "error", "told"),
+    [
+        (lambda: ball(1), SdfsimError, "two samples"),
+        (lambda: sample_grid(SphereSdf(0.5), np.array([[-np.inf] * 3, [np.inf] * 3]), 8), SdfsimError, "no extent"),
+        (
+            lambda: GridSdf(torch.zeros((4, 4, 5)), Frame(np.zeros(3), 1.0), BOUNDS),
+            ValueError,
+            "equal numbers of samples",
+        ),
+        (lambda: GridSdf(torch.zeros((4, 4)), Frame(np.zeros(3), 1.0), BOUNDS), ValueError, "equal numbers of samples"),
+        (
+            lambda: GridSdf(torch.zeros((1, 1, 1)), Frame(np.zeros(3), 1.0), BOUNDS),
+            ValueError,
+            "equal numbers of samples",
+        ),
+    ],
+)
+def test_grids_that_cannot_be_are_refused(make, error, told) -> None:
+    with pytest.raises(error, match=told):
+        make()
 
 
 @pytest.mark.gpu

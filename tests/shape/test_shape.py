@@ -194,16 +194,19 @@ def test_another_sdf_of_the_same_shape_survives_saving_and_scaling(tmp_path: Pat
     assert type(load_shape(large.save(tmp_path / "large")).sdf) is member
 
 
-def test_what_has_no_such_sdf_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("act", "told"),
+    [
+        (lambda folder: with_sdf(analytic_shape("sphere", radius=1.0), "mlp"), "no SDF network"),
+        (lambda folder: with_sdf(analytic_shape("plane"), "grid"), "plane"),
+        # The folder holds one mesh: an exact SDF of another one would silently become that one's.
+        (lambda folder: replace(fitted(), sdf=MeshSdf(primitives.box())).save(folder), "another mesh"),
+    ],
+)
+def test_what_has_no_such_sdf_is_refused(tmp_path: Path, act, told) -> None:
     assert with_sdf(fitted(), "mlp").certificate == fitted().certificate
-    with pytest.raises(SdfsimError, match="no SDF network"):
-        with_sdf(analytic_shape("sphere", radius=1.0), "mlp")
-    with pytest.raises(SdfsimError, match="plane"):
-        with_sdf(analytic_shape("plane"), "grid")
-    # The folder holds one mesh: an exact SDF of another one would silently become that one's.
-    other = replace(fitted(), sdf=MeshSdf(primitives.box()))
-    with pytest.raises(SdfsimError, match="another mesh"):
-        other.save(tmp_path)
+    with pytest.raises(SdfsimError, match=told):
+        act(tmp_path)
 
 
 @pytest.mark.parametrize(("kind", "member"), OTHERS)

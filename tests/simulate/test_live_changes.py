@@ -277,9 +277,7 @@ def test_what_is_no_state_of_the_scene_is_refused(simulator, given, message):
 
 
 def test_a_file_that_holds_no_state_is_refused(tmp_path):
-    file = tmp_path / "other.npz"
-    np.savez(file, a=np.zeros(3))
-    with pytest.raises(SdfsimError, match=r"other\.npz: not a state of this version"):
-        State.read(file)
-    with pytest.raises(SdfsimError, match=r"none\.npz: no such file"):
-        State.read(tmp_path / "none.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    for name, told in (("other.npz", "not a state of this version"), ("none.npz", "no such file")):
+        with pytest.raises(SdfsimError, match=f"{name}: {told}"):
+            State.read(tmp_path / name)

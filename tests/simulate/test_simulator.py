@@ -93,25 +93,28 @@ def test_a_simulator_takes_a_path_and_a_sample(tmp_path):
         Simulator("truth.yaml")
 
 
-@pytest.mark.parametrize("wrong", [3, None, {"bodies": []}])
-def test_what_is_no_scene_is_refused(wrong, tmp_path):
-    with pytest.raises(SdfsimError, match=rf"scene: must be a Scene, the path .*got a {type(wrong).__name__}"):
-        Simulator(wrong)
-    with pytest.raises(SdfsimError, match="source: must be a path"):
-        sdfsim.export(wrong, tmp_path / "out.glb")
+SCENE, SOURCE = "scene: must be a Scene, the path .*got a ", "source: must be a path"
+
+
+@pytest.mark.parametrize(
+    ("act", "told"),
+    [
+        (lambda out: Simulator(3), SCENE + "int"), (lambda out: Simulator(None), SCENE + "NoneType"),
+        (lambda out: Simulator({"bodies": []}), SCENE + "dict"),
+        (lambda out: sdfsim.export(3, out / "out.glb"), SOURCE),
+        (lambda out: sdfsim.export(None, out / "out.glb"), SOURCE),
+        (lambda out: sdfsim.export({"bodies": []}, out / "out.glb"), SOURCE),
+        (lambda out: sdfsim.export(box(), out / "out.glb"), SOURCE + r" \(got a SceneBuilder\)\nhint: .*scene\.save"),
+        (lambda out: sdfsim.render(box(), 3, out / "out.png"), "rollout: must be a Rollout or the path"),
+    ],
+)  # fmt: skip
+def test_what_is_no_scene_source_or_rollout_is_refused_with_what_is_wanted(act, told, tmp_path):
+    with pytest.raises(SdfsimError, match=told):
+        act(tmp_path)
 
 
 @pytest.mark.parametrize("count", [0.5, -1, "3", None, True])
-def test_steps_are_whole_numbers(count):
-    sim = Simulator(box())
+@pytest.mark.parametrize("act", [lambda sim, count: sim.step(count), lambda sim, count: next(sim.steps(count))])
+def test_steps_are_whole_numbers(count, act):
     with pytest.raises(SdfsimError, match="steps: must be a whole number"):
-        sim.step(count)
-    with pytest.raises(SdfsimError, match="steps: must be a whole number"):
-        next(sim.steps(count))
-
-
-def test_render_and_export_say_what_they_want(tmp_path):
-    with pytest.raises(SdfsimError, match="rollout: must be a Rollout or the path"):
-        sdfsim.render(box(), 3, tmp_path / "out.png")  # type: ignore[arg-type]
-    with pytest.raises(SdfsimError, match=r"source: must be a path \(got a SceneBuilder\)\nhint: .*scene\.save"):
-        sdfsim.export(box(), tmp_path / "out.glb")  # type: ignore[arg-type]
+        act(Simulator(box()), count)

@@ -19,7 +19,6 @@ from sdfsim.physics.bodies import Units
 from sdfsim.physics.free_flight import fly
 from sdfsim.physics.options import Options
 from sdfsim.physics.solver.prepare import Compiled, points_near
-from sdfsim.shape.make import analytic_shape
 from sdfsim.simulate.simulator import Simulator
 from sdfsim.training import train as train_module
 from sdfsim.training.batches import moved
@@ -29,7 +28,7 @@ from sdfsim.training.presets import PRESETS
 from sdfsim.training.run import Run, held_out_loss
 from sdfsim.training.surface_task import SurfaceTask
 from sdfsim.training.train import train
-from tests.helpers.recordings import bouncing, slab_data, sliding
+from tests.helpers.recordings import BALL, BALLS, bouncing, slab_data, sliding, write_dataset
 from tests.helpers.scenes import in_torch, random_model
 
 CPU = torch.device("cpu")
@@ -296,12 +295,7 @@ def test_a_run_does_not_go_on_with_other_data(ball_data, presets, preset, tmp_pa
 
 def dataset(folder, *trajectories: Trajectory):
     """A dataset of balls with nothing but these to train on."""
-    analytic_shape("sphere", radius=0.5, name="ball").save(folder / "shapes" / "ball")
-    (folder / "train").mkdir()
-    for k, t in enumerate(trajectories):
-        t.save(folder / "train" / f"{k}.npz")
-    (folder / "dataset.json").write_text('{"recipe": "balls", "seed": 0}')
-    return folder
+    return write_dataset(folder, BALL, {"train": [*trajectories]}, BALLS)
 
 
 @pytest.mark.parametrize("dt", [1 / 60, 0.02, 0.04])
