@@ -65,6 +65,7 @@ MOST_GROUPS = 31  # MuJoCo's bit masks
 # MuJoCo refuses moments of inertia below 1e-14 kg m^2, and convex pieces of hardly any volume. Below this moment,
 # kg m^2, or this size of a mesh, m, the unit of length is a thousandth.
 LEAST_MOMENT, LEAST_SIZE, FINER = 1e-13, 1e-3, 1000.0
+SMOOTH = 3.0  # accelerations of gravity: a faster change of velocity is an impact
 WEIGHTLESS = 1e-9  # kg, of a link of URDF that is only a frame
 MOST_TOLD = 8  # names in a line of the report
 # Names that are taken: our own, MuJoCo's, and device names, which Windows does not allow for files.
@@ -109,15 +110,19 @@ class Take:
         return 6.0 * framed(self.scene)[1]
 
     def at_rate(self, fps: float) -> "Take":
-        """The same motion at `fps` evenly spaced times per second, interpolated between frames by their velocities, so
-        that a flight stays a parabola. The last time is not before the end, and has the last pose."""
+        """The same motion at `fps` evenly spaced times per second, interpolated between frames, by their velocities
+        where nothing hits: so a flight stays a parabola. The last time is not before the end, and has the last pose."""
         from scipy.interpolate import CubicHermiteSpline
 
         count = int(np.ceil((self.time[-1] - self.time[0]) * fps - 1e-3)) + 1
         time = self.time[0] + np.arange(count) / fps
         place, turn = between(self.time, self.position, self.quat_xyzw, time)
         if self.moving:
-            place = CubicHermiteSpline(self.time, self.position, self.velocity)(np.minimum(time, self.time[-1]))
+            curved = CubicHermiteSpline(self.time, self.position, self.velocity)(np.minimum(time, self.time[-1]))
+            change = np.linalg.norm(np.diff(self.velocity, axis=0), axis=-1) / np.diff(self.time)[:, None]
+            row = np.clip(np.searchsorted(self.time, time) - 1, 0, len(change) - 1)
+            smooth = change <= SMOOTH * max(float(np.linalg.norm(self.scene.gravity)), 1.0)
+            place = np.where(smooth[row][..., None], curved, place)
         return replace(self, time=time, position=place, quat_xyzw=turn, velocity=0.0 * place, rate=fps)
 
 

@@ -6,25 +6,44 @@ import hashlib
 import json
 import logging
 import os
+import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 from sdfsim.base.files import user_cache
 
 _log = logging.getLogger(__name__)
-_lock = Lock()
+_lock = threading.Lock()
 _ready: set[tuple] = set()  # functions with types of arguments that this process has compiled, or found compiled
 _spent = 0.0  # s, see `seconds_spent`
 _open: list[float] = []  # when the compilations began that are going on in this process
 _watched = _said = False
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Ctrl-C waits for the end of the block: a handler that raises an exception while numba converts arguments or
+    results ends the process."""
+    handler = signal.getsignal(signal.SIGINT)
+    if not callable(handler) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    pressed: list[tuple[Any, ...]] = []
+    signal.signal(signal.SIGINT, lambda *given: pressed.append(given))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if pressed:
+            handler(*pressed[0])
 
 
 # The module path comes first: reading the types imports modules from it.

@@ -110,7 +110,7 @@ with kept(cache_of([*sources(), Path(__file__)])):
             last = max(len(script.pose) - steps, 0)  # after it the paths have ended
             k = min(told.number[w], last)
             part = Script(script.body, script.pose[k : k + steps], script.velocity[k : k + steps])
-            (pair, count, point), _, _, broken, _, _, _, _, _ = run_steps(
+            manifolds, _, _, broken, _, _, _, _, _ = run_steps(
                 nth(shapes, 0), nth(worlds, w), nth(works, w), motion, rules, manifolds, nth(joints, w), pieces, part,
                 most, kept, REPORTED, steps,
             )  # fmt: skip
@@ -122,14 +122,14 @@ with kept(cache_of([*sources(), Path(__file__)])):
                 motion.angular[:] = angular
                 each.state[:] = state
                 continue
-            held[w] = manifolds = Manifolds(pair, count, point)
+            held[w] = manifolds
             told.number[w] += steps
             told.force[w] = 0.0
-            pair, _, _, impulse, _ = touching(manifolds, motion.position, motion.orientation, REPORTED)
-            for e in range(len(pair)):
+            found = touching(manifolds, motion.position, motion.orientation, REPORTED)
+            for e in range(len(found.pair)):
                 for x in range(3):
-                    told.force[w, pair[e, 0], x] += impulse[e, x]
-                    told.force[w, pair[e, 1], x] -= impulse[e, x]
+                    told.force[w, found.pair[e, 0], x] += found.impulse[e, x]
+                    told.force[w, found.pair[e, 1], x] -= found.impulse[e, x]
 
     @njit(**BARE)
     def _disturb(motion, manifolds, changed):

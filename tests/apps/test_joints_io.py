@@ -751,6 +751,14 @@ def test_a_mimic_is_a_coupling_here_and_in_exports(tmp_path: Path) -> None:
     (coupling,) = scene.couplings
     assert [scene.joints[j].name for j in coupling.joints] == ["rail", "shoulder"]
     assert (coupling.ratio, coupling.offset) == (0.5, -0.1)
+    rail = scene.joints[coupling.joints[0]]
+    assert rail.start == -0.1  # where it has to be, as the other starts at zero
+    simulator = Simulator(scene)
+    simulator.step()
+    assert abs(simulator.joint("rail").speed) < 0.5
+    for text, told in ((HAND.replace('joint="shoulder" mult', 'joint="rail" mult'), "rail cannot follow itself"),):
+        with pytest.raises(SdfsimError, match=told):
+            imported(write(tmp_path, "circle.urdf", text))
     export(scene, tmp_path / "back.urdf")
     (back,) = imported(next(tmp_path.glob("back*.urdf")), fixed=True)[0].couplings
     assert (back.ratio, back.offset) == (0.5, pytest.approx(-0.1))

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import int64, typeof
 
-from sdfsim.base.compiling import compile_before, running
+from sdfsim.base.compiling import compile_before, running, uninterrupted
 from sdfsim.physics import joint_columns, pose
 from sdfsim.physics import joints as jointed
 from sdfsim.physics.bodies import Bodies, State, Touch, Tracks
@@ -148,8 +148,8 @@ class Compiled:
         if self.pieces is None:
             used = chosen(surfaces=self.surfaces, threads=self.threads, joints=joints > 0)
             self.pieces = _compiled("the contact step", run_steps, arguments, others, used)
-        manifolds, *found = run_steps(*arguments, self.pieces, *others)
-        return compiled.Manifolds(*manifolds), *found, kept
+        with uninterrupted():
+            return *run_steps(*arguments, self.pieces, *others), kept
 
     def advance(self, state: State, options: Options, steps: int, most: np.ndarray, *, keep: bool = False) -> Steps:
         """Make `steps` steps of the contact solve from `state`, or fewer if one leads to a state beyond the limits
@@ -303,7 +303,7 @@ def disturbed(bodies: Bodies, state: State, changed: np.ndarray, moved: np.ndarr
 
 def contact_points(state: State) -> Touching:
     """Where bodies touch in a state."""
-    return Touching(*touching(_manifolds(state.touch), state.position, state.orientation, REPORTED))
+    return touching(_manifolds(state.touch), state.position, state.orientation, REPORTED)
 
 
 def nodes_near(

@@ -51,8 +51,7 @@ def run_steps(shapes, world, work, motion, rules, manifolds, joints, pieces, scr
         within: bodies that are no farther apart count as touching.
 
     Returns:
-        The members of the manifolds at the end (Python code runs when a named tuple is returned, and an interrupt in it
-        would end the process); the counts of the last step, as in `Kept`; the
+        The manifolds at the end; the counts of the last step, as in `Kept`; the
         number of steps made; the body whose state is invalid after the next step (-1: none), and what is wrong with it;
         where that body was before that step; the work of pulls; and for all kept steps, one after the other, the pairs
         of bodies that touch [C, 2] and the points [C, 3] where they touch.
@@ -93,42 +92,22 @@ def run_steps(shapes, world, work, motion, rules, manifolds, joints, pieces, scr
                     motion.position, motion.orientation, motion.velocity, motion.angular, place, i, b, dt, most
                 )
                 if wrong >= 0:
-                    return (
-                        (manifolds.pair, manifolds.count, manifolds.point),
-                        counts,
-                        k,
-                        b,
-                        wrong,
-                        get(place, i),
-                        total,
-                        pair[:found],
-                        point[:found],
-                    )
+                    return manifolds, counts, k, b, wrong, get(place, i), total, pair[:found], point[:found]
         pulled = _pulled(going, work.wrench, motion, place, spin, dt)
         pulled += given(joints.each)
         total += pulled
         if len(kept.depth):
             _keep(written, k, world, motion, rules, counts, pulled)
             _keep_joints(written, k, joints.each)
-            two, place_of, _, _, gap = touching(manifolds, motion.position, motion.orientation, within)
-            pair, point = _with_room(pair, point, found, found + len(two))
-            written.count[k, 4], written.depth[k] = len(two), 0.0
-            for e in range(len(two)):
-                pair[found, 0], pair[found, 1] = two[e, 0], two[e, 1]
-                put(point, found, get(place_of, e))
-                written.depth[k] = max(written.depth[k], -gap[e])
+            here = touching(manifolds, motion.position, motion.orientation, within)
+            pair, point = _with_room(pair, point, found, found + len(here.pair))
+            written.count[k, 4], written.depth[k] = len(here.pair), 0.0
+            for e in range(len(here.pair)):
+                pair[found, 0], pair[found, 1] = here.pair[e, 0], here.pair[e, 1]
+                put(point, found, get(here.point, e))
+                written.depth[k] = max(written.depth[k], -here.gap[e])
                 found += 1
-    return (
-        (manifolds.pair, manifolds.count, manifolds.point),
-        counts,
-        steps,
-        -1,
-        0,
-        (0.0, 0.0, 0.0),
-        total,
-        pair[:found],
-        point[:found],
-    )
+    return manifolds, counts, steps, -1, 0, (0.0, 0.0, 0.0), total, pair[:found], point[:found]
 
 
 @njit(**BARE)

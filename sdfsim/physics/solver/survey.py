@@ -70,7 +70,7 @@ def energies(mass, inertia, gravity, position, orientation, velocity, angular):
 
 @njit(**ENTRY)
 def touching(manifolds, position, orientation, within):
-    """The members of `Touching`: of the contacts of bodies that are no farther apart than `within`."""
+    """The contacts of bodies that are no farther apart than `within`."""
     most = points_of(manifolds, len(manifolds.count))
     pair, gap = np.empty((most, 2), np.int64), np.empty(most)
     place, normal, impulse = np.empty((most, 3)), np.empty((most, 3)), np.empty((most, 3))
@@ -87,4 +87,4 @@ def touching(manifolds, position, orientation, within):
                 put(normal, e, n)
                 put(impulse, e, add(scale(n, point[NORMAL_IMPULSE]), drag))
                 e += 1
-    return pair[:e], place[:e], normal[:e], impulse[:e], gap[:e]
+    return Touching(pair[:e], place[:e], normal[:e], impulse[:e], gap[:e])
