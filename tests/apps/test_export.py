@@ -618,7 +618,7 @@ def test_the_command_reports_what_it_wrote_and_what_it_left_out(dropped, tmp_pat
     report = json.loads(done.stdout)
     assert report["format"] == "urdf" and report["bodies"] == 10
     assert {Path(file) for file in report["files"]} >= {
-        tmp_path / "new" / "run.csv",
+        tmp_path / "new" / "run.poses.csv",
         tmp_path / "new" / "run.ball.urdf",
     }
     assert any("the motion" in line for line in report["left_out"])
@@ -683,7 +683,7 @@ def test_a_csv_has_the_poses_of_the_origins_wherever_they_are(survey: Path) -> N
     rows = list(csv.DictReader(survey.with_suffix(".csv").open()))
     assert [float(rows[1][axis]) for axis in "xyz"] == [0.0, 0.0, 0.0]
     export(survey, survey.with_suffix(".urdf"))
-    rows = list(csv.DictReader(survey.with_suffix(".csv").open()))
+    rows = list(csv.DictReader(survey.with_suffix(".poses.csv").open()))
     np.testing.assert_allclose([float(rows[1][axis]) for axis in "xyz"], FAR + np.array([4, 4, 1.5]), atol=1e-6)
 
 

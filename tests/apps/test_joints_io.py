@@ -751,9 +751,11 @@ def test_a_mimic_is_a_coupling_here_and_in_exports(tmp_path: Path) -> None:
     (coupling,) = scene.couplings
     assert [scene.joints[j].name for j in coupling.joints] == ["rail", "shoulder"]
     assert (coupling.ratio, coupling.offset) == (0.5, -0.1)
-    rail = scene.joints[coupling.joints[0]]
-    assert rail.start == -0.1  # where it has to be, as the other starts at zero
-    simulator = Simulator(scene)
+    text = HAND.replace('offset="-0.1"', 'offset="0.05"')  # the other starts at its lower limit
+    offset, _ = imported(write(tmp_path, "offset.urdf", text), fixed=True)
+    rail, shoulder = (offset.joints[j] for j in coupling.joints)
+    assert rail.start == pytest.approx(0.5 * shoulder.start + 0.05) != 0.0
+    simulator = Simulator(offset)
     simulator.step()
     assert abs(simulator.joint("rail").speed) < 0.5
     for text, told in ((HAND.replace('joint="shoulder" mult', 'joint="rail" mult'), "rail cannot follow itself"),):

@@ -127,8 +127,12 @@ def test_size_rate_and_background_are_as_asked(tmp_path):
         stream = movie.streams.video[0]
         assert (stream.width, stream.height, stream.average_rate) == (64, 32, 12.5)
         assert sum(1 for _ in movie.decode(stream)) == round(rollout.time[-1] * 12.5) + 1
-    for wrong in ({"size": (33, 32)}, {"background": "none"}, {"fps": 0.0}):
-        with pytest.raises(SdfsimError, match="movie"):
+    for wrong, told in (
+        ({"size": (33, 32)}, "even"),
+        ({"background": "none"}, "transparent"),
+        ({"fps": 0.0}, "above zero"),
+    ):
+        with pytest.raises(SdfsimError, match=told):
             render(scene, rollout, tmp_path / "no.mp4", **wrong)
     with pytest.raises(SdfsimError, match="no such colour"):
         render(scene, rollout, tmp_path / "no.png", background="blurple")
