@@ -88,6 +88,22 @@ def test_a_fast_ball_with_backspin_leaves_the_ground_as_a_slow_one(speed):
     assert rollout.angular_velocity[-1, 1, 1] == pytest.approx(ahead / radius, rel=0.01)
 
 
+@pytest.mark.parametrize("load", [0.6, 0.85, 0.93, 1.05])
+def test_a_grip_holds_as_long_as_its_friction_does(load):
+    """A cube between a wall and a light pusher on a slider: no corner bears all of the push."""
+    force = GRAVITY / load / 0.8
+    scene = Scene().add("wall", plane={"normal": [-1, 0, 0], "offset": 0}, friction=1.0, restitution=0.0)
+    cube = {"size": (0.05, 0.05, 0.05)}
+    scene.add("cube", box=cube, position=(-0.025, 0, 0), mass=1.0, friction=0.8, restitution=0.0)
+    pusher = {"size": (0.02, 0.04, 0.04)}
+    scene.add("pusher", box=pusher, position=(-0.06, 0, 0), mass=0.1, friction=1.0, restitution=0.0)
+    scene.join("slider", "slider", "pusher", "world", axis=(1, 0, 0))
+    simulator = Simulator(scene)
+    simulator["pusher"].pull((force / 2, 0, 0))
+    fallen = simulator.run(1.0).position[-1, 1, 2]
+    assert (fallen > -1e-5) if load < 1.0 else (fallen < -1e-2)
+
+
 INTERRUPTED = """
 import os, signal, threading, time
 import numpy as np

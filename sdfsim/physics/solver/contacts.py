@@ -21,7 +21,7 @@ from sdfsim.physics.solver.rows import (
     within,
     write_point,
 )
-from sdfsim.physics.solver.tolerances import MET, NO_PULL, NO_SLIP, RESOLVED, THIN_EARLY
+from sdfsim.physics.solver.tolerances import EVENED, MET, NO_PULL, NO_SLIP, RESOLVED, THIN_EARLY
 from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, three, turn, vector
 from sdfsim.physics.solver.world import (
     END,
@@ -163,6 +163,26 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 for x in range(NORMAL_IMPULSE, KEY):
                     manifolds.point[m, k, x] = 0.0
     return count
+
+
+@njit(**BARE)
+def even_out(manifolds, graph, rules):
+    """Move the impulses from which the points of a body in a joint begin towards their mean. What a joint keeps from
+    turning may press with any one of its corners, and the first row would take it all: friction would then act there
+    alone, and a body in a grip turn about that corner."""
+    for m in range(len(manifolds.count)):
+        if graph.of_body[manifolds.pair[m, 0]] < 0 and graph.of_body[manifolds.pair[m, 1]] < 0:
+            continue
+        points, count = manifolds.point[m], manifolds.count[m]
+        for k in range(count):
+            total, others, first = 0.0, 0, k
+            for e in range(count):
+                if points[e, KEY] == points[k, KEY] and points[e, GAP] <= rules.slop:
+                    total, others, first = total + points[e, NORMAL_IMPULSE], others + 1, min(first, e)
+            if first == k and others > 1:  # once for all points of two patches
+                for e in range(k, count):
+                    if points[e, KEY] == points[k, KEY] and points[e, GAP] <= rules.slop:
+                        points[e, NORMAL_IMPULSE] += EVENED * (total / others - points[e, NORMAL_IMPULSE])
 
 
 @njit(**BARE)

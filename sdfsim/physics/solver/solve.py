@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit, prange
 
 from sdfsim.physics.joint_columns import BROKEN, GIVEN
-from sdfsim.physics.solver.contacts import contact_rows, most_contacts, remember
+from sdfsim.physics.solver.contacts import contact_rows, even_out, most_contacts, remember
 from sdfsim.physics.solver.islands import islands_of
 from sdfsim.physics.solver.joints import (
     bounded_rows,
@@ -77,6 +77,8 @@ def solve(world, work, motion, rules, manifolds, joints, threads, phase):
         np.zeros((most, 4)), np.zeros(most), np.zeros(most), np.empty(0, np.int64), np.empty(0, np.int64),
         np.empty(0, np.int64), np.empty(0, np.int64),
     )  # fmt: skip
+    if joints is not None:
+        even_out(manifolds, joints.graph, rules)
     count = np.int64(contact_rows(world, work, motion, rules, manifolds, reference(room), phase))
     if joints is not None:
         count = bounded_rows(work, motion, rules, joints, reference(room), count, phase)

@@ -58,6 +58,7 @@ ENERGY_GAIN = 1e-4  # part of the energy with which contacts meet: an impact gai
 # The larger the ratio of masses, the more slowly sweeps carry a load to lighter bodies. The number of sweeps of an
 # island is multiplied by its ratio divided by the first number, at most by the second.
 EVEN_MASSES, MOST_OFTEN = 30.0, 30.0
+EVENED = 0.2  # share of the difference to their mean that impulses of a face lose before each inner step, beside joints
 JOINTS_EXACT = 0.01  # relative to the precision to which contacts without joints are solved
 END_EXACT = 0.1  # likewise at the end of a step, whose velocities users see
 MANY_ISLANDS = 64  # number of islands from which threads pay off
