@@ -613,3 +613,38 @@ def test_what_lies_on_something_only_slides_and_turns_there(tmp_path):
         np.testing.assert_allclose(about, (about @ up) * up, atol=1e-9)
         assert about @ up == pytest.approx(0.7, abs=0.05)
         np.testing.assert_allclose(up @ axes(lying, NEAR_EYE, place, turned)[:3], 0.0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_paint_shows_how_a_can_is_turned(tmp_path):
+    """It slides and turns about its axis, which its outline does not show."""
+    import trimesh
+
+    can = trimesh.creation.cylinder(0.05, 0.12, sections=96).subdivide().subdivide().subdivide()
+    around, up = np.arctan2(can.vertices[:, 1], can.vertices[:, 0]), np.abs(can.vertices[:, 2])
+    light = 120 + 70 * np.sign(np.sin(3 * around + 1.2 * np.sin(around))) * (up < 0.045)
+    can.visual.vertex_colors = np.c_[light, 0.8 * light, 0.6 * light, np.full(len(light), 255)].astype(np.uint8)
+    can.export(tmp_path / "can.ply")
+    scene = sdfsim.Scene(model="solver").add("floor", plane={}, friction=1.0)
+    scene = scene.add("can", mesh=str(tmp_path / "can.ply"), sdf="mesh", position=(-0.2, 0, 0.06), mass=0.3).load()
+    look = Look(scene, scene.bodies[1])
+    assert look.ways == 6 and look.lying(scene, scene.bodies[1]).ways == 3
+    assert look_of(mesh=prism_file(tmp_path, 96)).ways == 5
+
+    def motion(time):
+        turn = Rotation.from_euler("z", 2.0 * max(0.0, time)).as_quat()
+        return np.array([np.zeros(3), [-0.2 + 0.3 * max(0.0, time), 0, 0.06]]), np.array([[0, 0, 0, 1.0], turn])
+
+    camera = Camera((0, -0.8, 0.5), look_at=(0, 0, 0.05), fov=42, width=320, height=240)
+    places = [[x, y, 0.0] for x in (-0.3, 0.0, 0.3) for y in (-0.2, 0.2)] + [[0.0, 0.0, 0.2]]
+    points = [{"pixel": camera.project(np.array([p]))[0][0].tolist(), "place": p} for p in places]
+    (tmp_path / "points.yaml").write_text(yaml.safe_dump({"points": points}))
+    clip = filmed(tmp_path / "clip.mp4", scene, motion, camera, 1.0, 30, exposure=0.3)
+    film = watched(clip, scene, points=tmp_path / "points.yaml")
+    (track,) = film.tracks
+    assert len(track.frames) > 25
+    for k in track.frames:
+        place, turn = (one[1] for one in motion(film.clip.time[k] - film.clip.time[0]))
+        assert np.abs(film.eye.project(track.at(k).place) - film.eye.project(place)).max() < 0.5
+        off = Rotation.from_quat(track.at(k).turn) * Rotation.from_quat(turn).inv()
+        assert np.linalg.norm(off.as_rotvec()) < 0.03

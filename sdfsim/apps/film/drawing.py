@@ -21,6 +21,7 @@ from sdfsim.shape.shape import Shape
 
 SAMPLES, LINES = 4, 8  # places along a side of a pixel, and lines in it
 EVEN = 0.02  # radii by which a turned body that looks alike may differ
+SPOTTED = 8.0  # levels, of a paint that is not even
 HOVERS, UPRIGHT = 0.1, 0.99  # radii above what a body lies on; cosine between an axis and its normal
 FACES, LARGE = 8, 0.05  # most parts with a colour of their own; least share of the surface of one
 
@@ -71,6 +72,9 @@ class Look:
             self.parts, self.round = int(self.part.max()) + 1, bool((self.part == 0).sum() > 2)
             area = area_vectors(vertices[shape.mesh.faces]) * (self.part == 0)[:, None]
             self.bent = area / np.maximum(np.linalg.norm(area, axis=1), 1e-20)[:, None]  # normals of what is round
+            self.spots = _spots(shape.mesh, self.part)
+            if self.spots.shape[1]:  # which show how it is turned
+                self.axis, self.faces = None, []
 
     @property
     def ways(self) -> int:
@@ -134,8 +138,9 @@ class Look:
         return self.patterns(eye, place, turn, at)[: self.parts]
 
     def patterns(self, eye: Eye, place: np.ndarray, turn: np.ndarray, at: Window) -> np.ndarray:
-        """[basis, h, w] float32, of which its brightness is made: the cover of its parts, and if it is round, that of
-        the first times the normal there [3], as what is matt is lit (Lambert)."""
+        """[basis, h, w] float32, of which its brightness is made: the cover of its parts; if it is round, that of the
+        first times the normal there [3], as what is matt is lit (Lambert); and if it is painted, how much brighter it
+        is there than its part."""
         if self.ball:
             x, y = np.arange(at.left, at.right) + 0.5, np.arange(at.top, at.bottom)[:, None] + 0.5
             ray = eye.rays(x, y)
@@ -164,9 +169,9 @@ class Look:
             return found
         seen = eye.seen(pose.rotate(turn, self.vertices) + place)
         pixel = eye.focal * seen[:, :2] / seen[:, 2:] + eye.middle - (at.left, at.top)
-        bent = pose.rotate(turn, self.bent) @ eye.rotation.T
-        found = _drawn(np.c_[pixel, 1.0 / seen[:, 2]], self.mesh_faces, self.part, self.parts, bent, high, wide)
-        return found if self.round else found[: self.parts]
+        bent = (pose.rotate(turn, self.bent) @ eye.rotation.T)[:, : 3 * self.round]
+        each = np.concatenate([bent, self.spots], 1)
+        return _drawn(np.c_[pixel, 1.0 / seen[:, 2]], self.mesh_faces, self.part, self.parts, each, high, wide)
 
 
 with kept(cache_of([Path(__file__)])):
@@ -191,9 +196,9 @@ with kept(cache_of([Path(__file__)])):
         return found
 
     @njit(cache=True)
-    def _drawn(corners, faces, part, parts, bent, high, wide):
-        """[parts + 3, high, wide] the share of each pixel that parts of a mesh cover: of samples in it, by what is
-        nearest; and the sum there of `bent` [F, 3]. `corners` [V, 3]: px, and one over the depth."""
+    def _drawn(corners, faces, part, parts, each, high, wide):
+        """[parts + K, high, wide] the share of each pixel that parts of a mesh cover: of samples in it, by what is
+        nearest; and the sum there of `each` [F, K]. `corners` [V, 3]: px, and one over the depth."""
         near = np.zeros((SAMPLES * high, SAMPLES * wide))
         which = np.full(near.shape, -1)
         for f in range(len(faces)):
@@ -217,14 +222,14 @@ with kept(cache_of([Path(__file__)])):
                     nearness = a + across * ((j + 0.5) / SAMPLES - ax) + down * (y - ay)
                     if nearness > near[i, j]:
                         near[i, j], which[i, j] = nearness, f
-        found = np.zeros((parts + 3, high, wide), np.float32)
+        found = np.zeros((parts + each.shape[1], high, wide), np.float32)
         for i in range(SAMPLES * high):
             for j in range(SAMPLES * wide):
                 f = which[i, j]
                 if f >= 0:
                     found[part[f], i // SAMPLES, j // SAMPLES] += 1.0 / SAMPLES**2
-                    for k in range(3):
-                        found[parts + k, i // SAMPLES, j // SAMPLES] += bent[f, k] / SAMPLES**2
+                    for k in range(each.shape[1]):
+                        found[parts + k, i // SAMPLES, j // SAMPLES] += each[f, k] / SAMPLES**2
         return found
 
 
@@ -238,6 +243,16 @@ def _axis_of(shape: Shape) -> np.ndarray | None:
         if np.abs(shape.sdf(turned)[0]).max() > EVEN * np.linalg.norm(points, axis=1).max():
             return None
     return axes[:, odd]
+
+
+def _spots(mesh: Mesh, part: np.ndarray) -> np.ndarray:
+    """[F, 1] how much brighter each face is than its part, in hundreds of levels; [F, 0] if it is of even colour."""
+    if mesh.colors is None:
+        return np.zeros((len(mesh.faces), 0))
+    light = mesh.colors.mean(1)[mesh.faces].mean(1)
+    size = np.linalg.norm(area_vectors(mesh.vertices[mesh.faces]), axis=1)
+    off = light - (np.bincount(part, size * light) / np.maximum(np.bincount(part, size), 1e-20))[part]
+    return (off / 100.0)[:, None][:, : int(np.sqrt(size @ off**2 / size.sum()) > SPOTTED)]
 
 
 def _planes(vertices: np.ndarray, faces: np.ndarray, part: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
