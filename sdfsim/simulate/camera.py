@@ -115,10 +115,10 @@ class Camera:
             raise SdfsimError("camera: position and look_at must be two different points")
         if not (np.linalg.norm(self.up) > 0 and 0.0 < self.fov < 180.0):
             raise SdfsimError(f"camera: up must not be zero, and fov between 0 and 180 degrees (got {self.fov:g})")
-        if not (1 <= min(self.width, self.height) and max(self.width, self.height) <= LARGEST):
-            raise SdfsimError(f"camera: {self.width} x {self.height} px: sides must be 1 to {LARGEST:,}")
-        if not min(self.focal or (1.0,)) > 0:
-            raise SdfsimError("camera: focal must be above zero")
+        if not (min(self.width, self.height) >= 1 and min(self.focal or (1.0,)) > 0):
+            raise SdfsimError("camera: width, height and focal must be above zero")
+        if max(self.width, self.height) > LARGEST:
+            raise SdfsimError(f"camera: {self.width} x {self.height} px (at most {LARGEST:,} a side)")
 
     @classmethod
     def posed(

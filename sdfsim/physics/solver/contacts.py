@@ -21,7 +21,7 @@ from sdfsim.physics.solver.rows import (
     within,
     write_point,
 )
-from sdfsim.physics.solver.tolerances import EVENED, MET, NO_PULL, NO_SLIP, RESOLVED, THIN_EARLY
+from sdfsim.physics.solver.tolerances import EVENED, MET, NO_PULL, NO_SLIP, RESOLVED, THIN_EARLY, TOGETHER
 from sdfsim.physics.solver.vectors import BARE, add, along, cross, dot, get, scale, sub, three, turn, vector
 from sdfsim.physics.solver.world import (
     END,
@@ -101,7 +101,9 @@ def contact_rows(world, work, motion, rules, manifolds, rows, phase):
                 fall = 2.0 * dot(coming, n) / (kick * h) * max(gap, 0.0) * (1.0 - bounce * bounce)
                 square = bounce * bounce * approach * approach + (fall if early else 0.0)
                 target, rebounds = -math.copysign(math.sqrt(max(square, 0.0)), approach), square > 0.0
-            if rebounds:  # where the surfaces will meet, or met, however far they are from each other now
+            # What rebounds from the ground does so where its surface meets it, however far that is now. The ground
+            # takes any angular momentum; between two bodies an impulse at two places would not conserve it.
+            if rebounds and (work.inverse_mass[a] == 0.0 or work.inverse_mass[b] == 0.0):
                 arm, other = mine, theirs
             # An impact is over before a body has turned: the gyroscopic torque acts after it.
             before = dot(free_fall, n) if rebounds else dot(then, n)
@@ -265,9 +267,13 @@ def _turning(free, a, b, arm, other):
 
 @njit(**BARE)
 def _bending(angular, a, b, arm, other, later):
-    """Change of the relative velocity a little `later`, as both arms turn: what sticks to a turntable moves along its
-    circle and not along the tangent. Bounded for bodies that turn far in that time."""
+    """Change of the relative velocity a little `later`, as both arms turn, for bodies that turn together: what sticks
+    to a turntable moves along its circle and not along the tangent. (What rolls touches elsewhere then.) Bounded for
+    bodies that turn far in that time."""
     one, two = get(angular, a), get(angular, b)
+    off = sub(one, two)
+    if dot(off, off) >= TOGETHER * (dot(one, one) + dot(two, two)):
+        return 0.0, 0.0, 0.0
     mine = scale(cross(one, cross(one, arm)), later / (1.0 + dot(one, one) * later * later))
     return sub(mine, scale(cross(two, cross(two, other)), later / (1.0 + dot(two, two) * later * later)))
 

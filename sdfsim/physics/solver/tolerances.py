@@ -20,6 +20,7 @@ SLOW = 2.0  # inner steps: an approach no faster than what gravity gives in this
 ROUNDS = 100  # largest number of sweeps of sequential impulses in an inner step
 MET = 1e-6  # model lengths: nearer is touching, so that rounding does not decide when bodies in contact meet
 REPORTED = 1e-3  # model lengths: nearer points are reported as contacts
+TOGETHER = 0.01  # relative, squared: angular velocities that differ by less are those of bodies that turn together
 NO_SLIP = 1e-9  # squared speed: slower tangential motion has no direction
 NO_PULL = 1e-6  # likewise of gravity along a surface, squared, relative to all of it
 # Bodies that approach by more than this part of their thickness in an inner step rebound before they have touched, else
