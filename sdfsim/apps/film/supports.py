@@ -28,6 +28,7 @@ BEGIN = ((4.0, 8.0), (1.5, 4.0), (0.0, 2.0))
 MENDED = 5  # px around a hole that its mending looks at
 VIEWS = 7  # frames that show how a face looks
 FULL = 0.98  # share of a pixel from which what is behind it does not matter
+UNSURE = 0.25  # px by which outlines are wrong alike in neighbouring frames
 BRIGHTER = 0.5, 2.0  # limits of how brightnesses of a face differ
 
 Front = Callable[[np.ndarray, int], np.ndarray]
@@ -155,8 +156,9 @@ def with_paths(clip: Clip, eye: Eye, scene: Scene, tracks: Sequence[Track]) -> S
 
 
 def _path(clip: Clip, eye: Eye, track: Track) -> Waypoints:
-    """A smooth path through the poses of a track. How smooth, cross-validation decides for each of six numbers, in the
-    camera's axes: across the picture frames are exact, in depth and tilt towards the camera they are not."""
+    """A smooth path through the poses of a track. How smooth, cross-validation decides for what frames show exactly:
+    places across the picture, and turns in it. In depth and tilt neighbouring frames err alike, which it would take
+    for motion that shakes what lies there: these are as smooth as outlines allow."""
     rows = track.frames
     time = clip.time[rows] - clip.time[0]
     local = np.stack([eye.seen(track.at(k).place) for k in rows])
@@ -164,9 +166,24 @@ def _path(clip: Clip, eye: Eye, track: Track) -> Waypoints:
     middle = turn[len(turn) // 2]
     away = pose.to_rotvec(pose.multiply(turn, pose.conjugate(middle))) @ eye.rotation.T
     columns = np.c_[local[:, :2] / local[:, 2:], np.log(local[:, 2]), away]
-    smooth = np.stack([make_smoothing_spline(time, column)(time) for column in columns.T], 1)
+    outline = UNSURE / (eye.focal * track.look.radius / float(np.median(local[:, 2])))
+    smooth = np.stack([_smooth(time, columns[:, n], outline * (n in (2, 3, 4))) for n in range(6)], 1)
     depth = np.exp(smooth[:, 2:3])
     place = (np.c_[smooth[:, :2] * depth, depth] - eye.translation) @ eye.rotation
     turned = pose.multiply(pose.from_rotvec(smooth[:, 3:] @ eye.rotation), middle)
     origin = place - pose.rotate(turned, np.tile(track.look.com, (len(rows), 1)))
     return Waypoints(time, origin, turned)
+
+
+def _smooth(time: np.ndarray, column: np.ndarray, unsure: float) -> np.ndarray:
+    """[N] numbers at times [N] s, smoothed by cross-validation, or more as long as they change by `unsure` (root mean
+    square) at most."""
+    best, low, high = make_smoothing_spline(time, column)(time), -12.0, 2.0
+    while unsure and high - low > 0.1:
+        middle = 0.5 * (low + high)
+        trial = make_smoothing_spline(time, column, lam=10.0**middle * float(np.ptp(time)) ** 3)(time)
+        if np.sqrt(np.mean((trial - column) ** 2)) > unsure:
+            high = middle
+        else:
+            low, best = middle, trial
+    return np.asarray(best)

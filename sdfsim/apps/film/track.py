@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import cv2
@@ -26,9 +27,10 @@ FEWER = 4  # orientations if it begins where the scene has it
 FOREGROUND = 4.5  # standard deviations of noise, of what moves
 TURNED, OTHERWISE = 0.6, 1.5  # rad from the scene's orientation, and how much less likely another is
 WORSE = 0.03  # score below the best, from which the best's orientation is tried again
-SEEN = 0.9  # share of the frames in which a body that lies is seen
+SEEN = 0.8  # share of the frames in which a body that lies is seen
 SAME, SAME_TURN = 0.2, 0.01  # px, and rad, between predictions that count as one
 JUMP = 0.3  # rad from what is likely, which makes a pose half as likely
+FASTER, LEAP = 1.5, 2.0  # times the fastest motion, and px, by which a body is elsewhere at most
 NEARER, APPROACH = 0.05, 5.0  # share of the distance to the camera, and m/s, by which it changes at most
 BACK = 0.3  # share of that distance by which it may differ from the scene's at first, or after the body was lost
 REBOUND = np.array([1.0, -0.6])  # of the speed in the picture, after an impact
@@ -218,20 +220,31 @@ def follow(
 
 def without_others(clip: Clip, eye: Eye, track: Track) -> Track:
     """The track without frames in which something else was followed, as a hand before the body, or a place that it
-    left: in most frames it is seen in another colour, or much better, or elsewhere just before or after."""
+    left: in most frames it is seen in another colour, or much better, or where it cannot have come by then."""
     rows = track.frames
     if track.look.support or not len(rows):
         return track
     hues, scores = np.array([_hue(track.at(k)) for k in rows]), np.array([track.at(k).score for k in rows])
     alike = (np.abs(hues - np.median(hues, 0)).max(1) < HUE) | bool(track.look.ball)
     rows = rows[alike & (scores > np.median(scores) - DIM)]
-    best = max(rows.tolist(), key=lambda k: track.at(k).score)
+    at, time = {k: eye.project(track.at(k).place) for k in rows.tolist()}, clip.time
+    speed = [np.hypot(*(at[k] - at[j])) / (time[k] - time[j]) for j, k in pairwise(rows.tolist())]
+    fastest = max(map(min, pairwise(speed)), default=np.inf)  # a single leap to elsewhere is no motion
+
+    def leaps(j: int, k: int) -> bool:
+        later = abs(float(time[k] - time[j]))
+        far = np.hypot(*(at[k] - at[j])) > FASTER * fastest * later + LEAP
+        return bool(far) or _jumps(track.look, eye, track.at(k), track.at(j), later)
+
+    leapt = [n for n, (j, k) in enumerate(pairwise(rows.tolist()), 1) if leaps(j, k)]
+    longest = max(np.split(rows, leapt), key=len)
+    best = max(longest.tolist(), key=lambda k: track.at(k).score)
     seen: list[Seen | None] = [None] * len(track.seen)
     seen[best] = track.at(best)
     for order in (rows[rows > best], rows[rows < best][::-1]):
         last = best
         for k in order.tolist():
-            if not _jumps(track.look, eye, track.at(k), track.at(last), float(clip.time[k] - clip.time[last])):
+            if not leaps(last, k):
                 last, seen[k] = k, track.at(k)
     return Track(track.look, seen)
 
