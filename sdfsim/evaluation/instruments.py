@@ -497,66 +497,100 @@ def _measured(course: _Course, frames: np.ndarray, deadline: float) -> tuple[Nea
     scene, rollout = course.scene, course.rollout
     size = np.array([course.solids[b.shape].thickness * b.scale for b in scene.bodies])
     reach = np.array([_reach(course.solids[b.shape], scene.shapes[b.shape]) * b.scale for b in scene.bodies])
-    strength = float(np.linalg.norm(scene.gravity))
+    last = len(rollout.time) - 1
+    pushed = {f: course.pushed[f + 1] if f < last else np.zeros(len(size), bool) for f in frames.tolist()}
+    margin = {f: _margin(course, f, size, reach) * acts for f, acts in pushed.items()}
     deepest: Near | None = None
-    widest: Near | None = None
-    rows, allowance, alone = [], [], []
-    for f in frames.tolist():
-        last = f == len(rollout.time) - 1
-        pushed = np.zeros(len(size), bool) if last else course.pushed[f + 1]
-        margin = np.zeros(len(size))
-        if not last:
-            dt = float(rollout.time[f + 1] - rollout.time[f])
-            speed = np.linalg.norm(rollout.velocity[f : f + 2], axis=2).max(0)
-            turning = np.maximum(_turning(course, f), _turning(course, f + 1))
-            turning = turning * np.where(np.isfinite(reach), reach, 0.0)
-            fastest = float((speed + turning).max(initial=0.0))
-            thick = np.where(np.isfinite(size), size, 0.0)
-            margin = pushed * (0.2 * thick + (speed + turning + fastest) * dt + strength * dt * dt)
-        pair = near_pairs(course, f, margin)
-        rows.append(np.column_stack([np.full(len(pair), f), pair]))
-        allowance.append(np.maximum(margin[pair[:, 0]], margin[pair[:, 1]]))
-        alone.append((f, np.flatnonzero(pushed)))
-    row, most = np.concatenate(rows), np.concatenate(allowance)
-    parts, done, chunk = [], 0, FEW
-    while done < len(row) and (not parts or time.perf_counter() < deadline):
-        cut = slice(done, done + chunk)
-        one, other = (placed(scene, rollout, row[cut, 0], row[cut, k]) for k in (1, 2))
-        parts.append(gaps(course.solids, one, other, most[cut]))
-        done, chunk = done + chunk, min(2 * chunk, MANY)
-    if done < len(row):
-        row, alone = row[:done], []
-    if parts:
-        found = Gaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        thin = np.minimum(size[row[:, 1]], size[row[:, 2]])
-        closing, turned = _coming(course, row, found, reach)
+    # Only pairs whose boxes overlap may overlap. They mostly show what pushes a body; what is farther away is measured
+    # for the others alone.
+    row = np.concatenate([_rows(course, f, np.zeros(len(size))) for f in margin])
+    near = _apart(course, row, margin, reach, deadline)
+    if len(near.row):
+        thin = np.minimum(size[near.row[:, 1]], size[near.row[:, 2]])
+        closing, _ = _coming(course, near.row, near.found, reach)
         # An impact is noticed within a step; a body may move that far into the other before it is stopped.
-        before, _ = _coming(course, row, found, reach, back=1)
-        share = (-found.apart - np.maximum(np.abs(closing), np.abs(before))) / thin
-        k = int(share.argmax()) if len(share) else -1
-        if k >= 0 and share[k] > 0:
-            deepest = _near(course, row[k], float(-found.apart[k]), float(share[k]))
-        # A body that a third one hits may hit the other within the same step, with its speed at the step's end.
-        later, turned_later = _coming(course, row, found, reach, back=-1)
-        free = found.surely - np.maximum(np.maximum(closing, later), 0.0) - np.maximum(turned, turned_later)
-    else:
-        thin, free, found = np.zeros(0), np.zeros(0), None
-    for f, bodies in alone:
-        here = row[:, 0] == f
-        for body in bodies.tolist():
-            mine = np.flatnonzero(here & ((row[:, 1] == body) | (row[:, 2] == body)))
-            if (free[mine] <= FREE * thin[mine]).any():
+        before, _ = _coming(course, near.row, near.found, reach, back=1)
+        share = (-near.found.apart - np.maximum(np.abs(closing), np.abs(before))) / thin
+        k = int(share.argmax())
+        if share[k] > 0:
+            deepest = _near(course, near.row[k], float(-near.found.apart[k]), float(share[k]))
+    if len(near.row) < len(row):
+        return deepest, None
+    free = near.free / np.minimum(size[row[:, 1]], size[row[:, 2]]) if len(row) else np.zeros(0)
+    touched = row[free <= FREE]
+    for f, body in touched[:, :2].tolist() + touched[:, ::2].tolist():
+        pushed[f][body] = False
+    farther = []
+    for f, acts in pushed.items():
+        pairs = _rows(course, f, margin[f] * acts)
+        asked = (acts[pairs[:, 1:]]).any(1)
+        farther.append(pairs[asked])
+    row = np.concatenate(farther)
+    wide = _apart(course, row, margin, reach, deadline)
+    if len(wide.row) < len(row):
+        return deepest, None
+    widest: Near | None = None
+    thin = np.minimum(size[row[:, 1]], size[row[:, 2]])
+    for f, acts in pushed.items():
+        for body in np.flatnonzero(acts).tolist():
+            mine = np.flatnonzero((row[:, 0] == f) & ((row[:, 1] == body) | (row[:, 2] == body)))
+            if (wide.free[mine] <= FREE * thin[mine]).any():
                 continue
             if not len(mine):
                 metres, part, second = np.inf, np.inf, -1
             else:
-                k = mine[free[mine].argmin()]
-                metres, part = float(found.surely[k]), float(free[k] / thin[k])  # type: ignore[union-attr]
+                k = mine[wide.free[mine].argmin()]
+                metres, part = float(wide.found.surely[k]), float(wide.free[k] / thin[k])
                 second = int(row[k, 1] + row[k, 2] - body)
             if widest is None or part > widest.part:
                 other = scene.bodies[second].name if second >= 0 else ""
                 widest = Near(metres, part, scene.bodies[body].name, other, float(rollout.time[f]))
     return deepest, widest
+
+
+def _margin(course: _Course, frame: int, size: np.ndarray, reach: np.ndarray) -> np.ndarray:
+    """[N] m, how far away what pushes a body in the step after a frame may be at its start."""
+    rollout = course.rollout
+    if frame == len(rollout.time) - 1:
+        return np.zeros(len(size))
+    dt = float(rollout.time[frame + 1] - rollout.time[frame])
+    speed = np.linalg.norm(rollout.velocity[frame : frame + 2], axis=2).max(0)
+    turning = np.maximum(_turning(course, frame), _turning(course, frame + 1))
+    turning = turning * np.where(np.isfinite(reach), reach, 0.0)
+    fastest = float((speed + turning).max(initial=0.0))
+    thick = np.where(np.isfinite(size), size, 0.0)
+    return 0.2 * thick + (speed + turning + fastest) * dt + float(np.linalg.norm(course.scene.gravity)) * dt * dt
+
+
+def _rows(course: _Course, frame: int, margin: np.ndarray) -> np.ndarray:
+    """[P, 3] the frame and the bodies of `near_pairs`."""
+    pair = near_pairs(course, frame, margin)
+    return np.column_stack([np.full(len(pair), frame), pair])
+
+
+class _Apart(NamedTuple):
+    row: np.ndarray  # [P, 3] frame and bodies
+    found: Gaps
+    free: np.ndarray  # [P] m, the least free space between them that may be left in the step after the frame
+
+
+def _apart(
+    course: _Course, row: np.ndarray, margin: dict[int, np.ndarray], reach: np.ndarray, deadline: float
+) -> _Apart:
+    """Distances of pairs, as far as the larger of their margins; only of the first ones if the deadline comes."""
+    most = np.array([margin[f][[one, other]].max() for f, one, other in row.tolist()])
+    parts, done, chunk = [], 0, FEW
+    while not parts or (done < len(row) and time.perf_counter() < deadline):
+        cut = slice(done, done + chunk)
+        one, other = (placed(course.scene, course.rollout, row[cut, 0], row[cut, k]) for k in (1, 2))
+        parts.append(gaps(course.solids, one, other, most[cut]))
+        done, chunk = done + chunk, min(2 * chunk, MANY)
+    row, found = row[:done], Gaps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    # A body that a third one hits may hit the other within the same step, with its speed at the step's end.
+    closing, turned = _coming(course, row, found, reach)
+    later, turned_later = _coming(course, row, found, reach, back=-1)
+    free = found.surely - np.maximum(np.maximum(closing, later), 0.0) - np.maximum(turned, turned_later)
+    return _Apart(row, found, free)
 
 
 def _near(course: _Course, row: Sequence[int] | np.ndarray, metres: float, part: float) -> Near:
