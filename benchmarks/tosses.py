@@ -27,7 +27,7 @@ from benchmarks.records import Cell, Out, progress, write_record
 from sdfsim.apps.identify.optimiser import identify
 from sdfsim.apps.identify.report import Identified, write_scene
 from sdfsim.apps.identify.residuals import repeated
-from sdfsim.apps.mujoco_world import MujocoWorld
+from sdfsim.apps.mujoco_world import MujocoWorld, Unstable
 from sdfsim.apps.observed import Recording, cleaned, with_velocities
 from sdfsim.base.errors import SdfsimError
 from sdfsim.base.files import read_arrays, write_text
@@ -311,7 +311,8 @@ class Tried(NamedTuple):
 def compared(
     thing: Thing, engines: dict[str, tuple[Engine, Bounds]], tosses: Path, out: Path, fits: dict[str, int]
 ) -> tuple[dict[str, Tried], list[Motion], float]:
-    """Fit and test ours, on so many tosses by its names, and every engine; also the true motions, and dt."""
+    """Fit and test ours, on so many tosses by its names, and every engine; also the true motions, and dt. Parameters
+    with which an engine is unstable cost as much as the cap."""
     scene = thing.load(out)
     dt, known = thing.tosses(tosses)
     groups = drawn(thing.begun(known, dt, scene))[:2]
@@ -326,8 +327,15 @@ def compared(
     for k, (name, (engine, bounds)) in enumerate(engines.items(), 1):
         progress(k / (len(engines) + 1), f"{name}: {ROUNDS} rounds of a search over {len(bounds)} parameters")
         run = partial(engine, scene, thing.inertia)
+
+        def loss(values: dict[str, float], run: partial[Motion] = run) -> float:
+            try:
+                return cost(errors(run(fit, dt, values), truths[0], thing.sides[0])[:2])
+            except Unstable:
+                return 2.0 * FAR
+
         try:
-            values = searched(lambda v, run=run: cost(errors(run(fit, dt, v), truths[0], thing.sides[0])[:2]), bounds)
+            values = searched(loss, bounds)
         except NotInstalled as error:
             progress(k / (len(engines) + 1), f"{name} is left out: {error.message}")
             continue

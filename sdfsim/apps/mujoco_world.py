@@ -14,6 +14,10 @@ from sdfsim.scene.scene import Scene
 MEMORY = 2**31  # bytes; contacts of many pieces need more than the file asks for
 
 
+class Unstable(SdfsimError):
+    """An engine gave up on a motion."""
+
+
 class MujocoWorld:
     """A scene in MuJoCo, at its start.
 
@@ -67,10 +71,10 @@ class MujocoWorld:
             self.engine.mj_resetDataKeyframe(self.model, self.data, 0)
 
     def advance(self, count: int) -> None:
-        """Make `count` steps. Raises SdfsimError if the motion is unstable."""
+        """Make `count` steps. Raises Unstable."""
         self.engine.mj_step(self.model, self.data, count)
         if any(self.data.warning[kind].number for kind in self.unstable):
-            raise SdfsimError("MuJoCo found the motion unstable and reset it")
+            raise Unstable("MuJoCo found the motion unstable and reset it")
 
     def state(self) -> tuple[np.ndarray, ...]:
         """Of the dynamic bodies' centres of mass: positions [M, 3] m, orientations [M, 4] xyzw of the shapes' axes,
