@@ -208,13 +208,27 @@ def follow(
     """The body in all frames, from its pose in frame k."""
     seen: list[Seen | None] = [None] * len(clip.time)
     seen[k] = first
+
+    def ahead(at: int, way: int) -> Seen | None:
+        before = [j for j in range(at - way, at - way * (FAR + 1), -way) if 0 <= j < len(seen) and seen[j]][:3]
+        frame = frame_of(clip, back, at, hidden[at] if hidden else None, way)
+        on_progress(0.0, f"frame {at}")
+        return _next(clip, look, eye, shutter, frame, at, [(j, seen[j]) for j in before], first, gravity)
+
     for way in (1, -1):
-        rows = range(k + way, len(seen) if way > 0 else -1, way)
-        for at in rows:
-            before = [j for j in range(at - way, at - way * (FAR + 1), -way) if 0 <= j < len(seen) and seen[j]][:3]
-            frame = frame_of(clip, back, at, hidden[at] if hidden else None, way)
-            seen[at] = _next(clip, look, eye, shutter, frame, at, [(j, seen[j]) for j in before], first, gravity)
-            on_progress(0.0, f"frame {at}")
+        for at in range(k + way, len(seen) if way > 0 else -1, way):
+            seen[at] = ahead(at, way)
+    # A turn may have been mistaken until a frame in which it was found: from there the way back is followed again.
+    for way in (1, -1):
+        better = False
+        for at in range(1, len(seen)) if way > 0 else range(len(seen) - 2, -1, -1):
+            last, one = seen[at - way], seen[at]
+            if last and one and not look.ball and (better or one.score < last.score - WORSE):
+                new = ahead(at, way)
+                better = new is not None and new.score > one.score
+                seen[at] = new if better else one
+            else:
+                better = False
     return without_others(clip, eye, Track(look, seen))
 
 
