@@ -216,11 +216,17 @@ def thrown(
     table, *things = scene.bodies
     bodies, joints = [replace(table, position=np.array([0.0, 0.0, values["height"]]))], []
     for k, start in enumerate(starts):
+        first = [getattr(start, name)[0] for name in MOTION]
         for joint in scene.joints:
             one, other = (of + k * len(things) for of in joint.bodies)
             drag, damping = values["drag"], values["damping_of_hinge"]
-            joints.append(replace(joint, name=f"joint{k}", bodies=(one, other), friction=drag, damping=damping))
-        first = (getattr(start, name)[0] for name in MOTION)
+            turn, held = (
+                Rotation.from_quat(first[1][of - 1]) * Rotation.from_quat(quat)
+                for of, quat in zip(joint.bodies, joint.quat_xyzw, strict=True)
+            )
+            angle = float((held.inv() * turn).as_rotvec()[0])
+            hinge = replace(joint, name=f"joint{k}", bodies=(one, other), friction=drag, damping=damping, start=angle)
+            joints.append(hinge)
         for body, place, quat, speed, spin in zip(things, *first, strict=True):
             bodies.append(replace(
                 body, name=f"{body.name}{k}", position=place + k * APART, quat_xyzw=quat, angular_velocity=spin,

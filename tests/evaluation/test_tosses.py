@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks import tosses as bench
 from benchmarks.tosses import (
     A_CUBE,
+    AN_ELBOW,
     ENGINES,
     FRAMES,
     OURS,
@@ -22,7 +24,7 @@ from benchmarks.tosses import (
     recorded,
 )  # fmt: skip
 from sdfsim.apps.observed import Recording
-from sdfsim.data.public_tosses import CUBE, Links
+from sdfsim.data.public_tosses import CUBE, Links, links_of
 from sdfsim.scene.load import load_scene
 
 DT, GRAVITY = 1.0 / 148.0, 9.81
@@ -116,3 +118,16 @@ def test_tosses_side_by_side_meet_the_table_alone(name, tmp_path):
     assert np.abs(together.position[1] - alone.position[0]).max() < 1e-6
     lies = 0.5 * SIDE * np.abs(Rotation.from_quat(alone.quat_xyzw[0, -1, 0]).as_matrix()[2]).sum()
     assert alone.position[0, -1, 0, 2] == pytest.approx(lies, abs=3e-3)  # it has come down
+
+
+@pytest.mark.parametrize("world", [bench.BulletWorld, bench.MujocoWorld])
+@pytest.mark.parametrize("angle", [-2.0, 0.9])
+def test_a_bent_elbow_begins_as_it_was_tossed(world, angle, tmp_path):
+    toss = links_of(np.array([[0.1, -0.2, 0.3]]), Rotation.from_rotvec([[0.4, 1.9, -0.7]]), np.array([angle]))
+    still, yes = np.zeros((1, 2, 3)), np.ones((1, 2), bool)
+    start = Recording("", DT, *toss, still, still, yes[:, 0], yes, yes, toss)
+    values = VALUES | {"drag": 0.0, "damping_of_hinge": 0.0}
+    scene = bench.thrown(AN_ELBOW.load(tmp_path), [start], DT, values, AN_ELBOW.inertia)
+    place, quat = world(scene, DT).state()[:2]
+    assert place == pytest.approx(toss.position[0], abs=1e-6)
+    assert (Rotation.from_quat(quat) * Rotation.from_quat(toss.quat_xyzw[0]).inv()).magnitude().max() < 1e-6
