@@ -307,7 +307,7 @@ def tradeoff(
     Args:
         source: dataset folder, or a scene file, which PyBullet then simulates; None: a random scene of boxes and balls.
         out: folder to write; results in it are kept.
-        models: names or paths (empty: the solver and the bundled networks on it).
+        models: names or paths (empty: the solver).
         quick: fewer variants on fewer, shorter scenes.
         engines: those of `INNER` besides PyBullet, which is always there.
 
