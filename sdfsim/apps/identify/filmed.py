@@ -35,6 +35,7 @@ BRAKED = 4.0  # m/s^2, by which friction usually slows
 LYING = 1.3  # rise of the cost up to which it does
 SEATED = 10.0  # standard deviations within which a body that seems to lie on something does
 WORSE = 3.0  # how much larger the remaining differences of long windows may be than those of short ones
+STILL = 1e6  # times slower, of bodies on paths that stand still
 SIZE = 0.1  # m, of the bodies for which windows are as long as said
 STARTS = 12  # numbers of a body's start: place, rotation, velocity, spin
 # What is known without the film, standard deviations, in the units of `Parameter`.
@@ -93,7 +94,7 @@ class Shots:
             self.rest[w, : n + 1] *= weight
             self.root[w, : n + 1] *= weight[..., None]
             self.camera[w, : n + 1] *= weight[..., None]
-        self._copies: dict[int, Copies] = {}
+        self._copies: dict[tuple[int, float], Copies] = {}
         size = problem.sizes
         speed = np.sqrt(9.81 * size)
         one = np.ones((self.many, 3))
@@ -101,13 +102,17 @@ class Shots:
             [one * size[:, None], one, one * speed[:, None], one * (speed / size)[:, None]], 1
         )  # [D, 12] what is large for a start
 
-    def run(self, starts: _Starts, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[C, L + 1, D, 3] and [C, L + 1, D, 4] from C starts, which are windows times variants."""
+    def run(self, starts: _Starts, values: np.ndarray, slower: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+        """[C, L + 1, D, 3] and [C, L + 1, D, 4] from C starts, which are windows times variants. Bodies on paths may
+        move many times `slower`: then they stay where they are when a window begins."""
         count, u = len(starts.position), self.problem.units
-        if count not in self._copies:
-            begin = [self.dt * t for _, t in self.begin] * (count // len(self.begin))
-            self._copies[count] = Copies(self.problem.scene, count, begin)
-        copies, dt = self._copies[count], self.dt / u.time
+        if (count, slower) not in self._copies:
+            scene, begin = self.problem.scene, [slower * self.dt * t for _, t in self.begin]
+            led = (b.path and replace(b.path, time=slower * b.path.time) for b in scene.bodies)
+            bodies = tuple(replace(b, path=path) for b, path in zip(scene.bodies, led, strict=True))
+            copies = Copies(replace(scene, bodies=bodies), count, begin * (count // len(begin)))
+            self._copies[count, slower] = copies
+        copies, dt = self._copies[count, slower], self.dt / u.time
         first = [
             a.reshape(count * self.many, -1)
             for a in (starts.position, starts.orientation, starts.velocity, starts.spin)
@@ -177,8 +182,8 @@ class Shots:
     def seated(self, starts: _Starts, values: np.ndarray) -> list[_Starts]:
         """The starts, and others in which bodies that seem to lie on something do: in the pose in which they come to
         rest if they begin at rest, as long as what was seen is not far from it. They move as before, or level."""
-        place, turn = self.run(replace(starts, velocity=0.0 * starts.velocity, spin=0.0 * starts.spin), values)
-        place, turn = place[:, -1], turn[:, -1]
+        resting = replace(starts, velocity=0.0 * starts.velocity, spin=0.0 * starts.spin)
+        place, turn = (of[:, -1] for of in self.run(resting, values, STILL))
         rotated = pose.to_rotvec(pose.multiply(turn, pose.conjugate(starts.orientation)))
         away = np.concatenate([place - starts.position, rotated], -1)
         off = np.einsum("wdij,wdj->wdi", self.root[:, 0], away)
