@@ -290,7 +290,7 @@ def test_a_plank_that_is_tilted_shows_the_friction_of_what_slides_on_it(tmp_path
 
     found = identify_clips([clip], scene, points=tmp_path / "points.yaml", bodies=["plank"])
     shown = next(e for e in found.estimates if (e.kind, e.name) == ("friction", "cube / plank"))
-    assert shown.value == pytest.approx(FRICTION, abs=0.05)  # the plank's own path has errors, too
+    assert shown.value == pytest.approx(FRICTION, abs=0.08)  # the plank's own path has errors, too
     assert shown.interval[0] < FRICTION < shown.interval[1]
     write_scene(found, tmp_path / "scene.yaml", tmp_path / "identified.yaml")
     again = sdfsim.load_scene(tmp_path / "identified.yaml")

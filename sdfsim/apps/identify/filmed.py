@@ -44,6 +44,7 @@ LEVEL = 0.005  # m, of heights
 PATH = math.radians(0.4)  # tilts of bodies on paths: they are seen
 # Of coefficients, which no film is expected to show better: what rendered films were off by, beyond their poses.
 SLACK = {"friction": 0.01, "restitution": 0.0065}
+LED = {"friction": 0.04}  # if a support is moved along: its path has errors, too
 LIKELY = 6.0  # rise of the cost beyond which a value is unlikely
 UNLIKE = 10.0  # standard deviations, of most poses, that no motion explains
 WORST = 4  # frames that are named
@@ -505,7 +506,8 @@ def _reported(fitting: Fitting, fit: _Fit, every: Sequence[dict[tuple[str, str],
             part, some = slope[w * size : (w + 1) * size], right[w * size : (w + 1) * size]
             left.append(np.linalg.solve(normal - part.T @ part + 1e-3 * np.diag(np.diag(normal)), part.T @ some))
         covariance = covariance + (len(own) - 1) * np.cov(np.array(left).T, bias=True).reshape(count, count)
-    exact = np.array([SLACK.get(p.kind, 0.0) for p in problem.parameters]) / width
+    slack = SLACK | (LED if problem.led else {})
+    exact = np.array([slack.get(p.kind, 0.0) for p in problem.parameters]) / width
     names = [(p.kind, p.name) for p in problem.parameters]
     rounds = np.array([[found.get(name, v) for name, v in zip(names, fit.values, strict=True)] for found in every])
     covariance = covariance + np.diag(exact**2 + np.square(rounds.std(0) / width))
